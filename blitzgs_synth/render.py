@@ -63,7 +63,7 @@ class RayCaster:
 
 
 # Four samples per pixel on a rotated grid: every row and column of the 4 x 4 subpixels is met once.
-_SAMPLES: Final = np.array([[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]], np.float32)
+SAMPLES: Final = np.array([[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]], np.float32)
 # So many that numpy's calls cost little beside their work; more gain nothing and take memory.
 _RAYS_AT_ONCE: Final = 240_000
 _OFFSET: Final = 0.02  # distance from the surface, in metres, at which a shadow ray starts
@@ -106,13 +106,13 @@ class City:
     def render(self, view: View) -> Bytes:
         """Return the photograph of a view: sRGB uint8 [height, width, 3]."""
         image = np.empty((view.height, view.width, 3), np.uint8)
-        rows = max(1, _RAYS_AT_ONCE // (view.width * len(_SAMPLES)))
+        rows = max(1, _RAYS_AT_ONCE // (view.width * len(SAMPLES)))
         for top in range(0, view.height, rows):
             bottom = min(top + rows, view.height)
-            pixels = np.empty((len(_SAMPLES), bottom - top, view.width, 2), np.float32)
-            pixels[..., 0] = np.arange(view.width) + _SAMPLES[:, None, None, 0]
-            pixels[..., 1] = np.arange(top, bottom)[:, None] + _SAMPLES[:, None, None, 1]
-            display = self._shade(view, pixels.reshape(-1, 2))
+            pixels = np.empty((len(SAMPLES), bottom - top, view.width, 2), np.float32)
+            pixels[..., 0] = np.arange(view.width) + SAMPLES[:, None, None, 0]
+            pixels[..., 1] = np.arange(top, bottom)[:, None] + SAMPLES[:, None, None, 1]
+            display = self.shade(view, pixels.reshape(-1, 2))
             image[top:bottom] = (display * 255 + 0.5).T.reshape(bottom - top, view.width, 3)
         return image
 
@@ -121,7 +121,7 @@ class City:
         directions = view.directions(pixels).astype(np.float32)
         return self.caster.hit(np.broadcast_to(view.centre.astype(np.float32), directions.shape), directions)
 
-    def _shade(self, view: View, pixels: Floats) -> Floats:
+    def shade(self, view: View, pixels: Floats) -> Floats:
         """Return display values [3, P] of P pixels from the positions of their samples [4 P, 2], P by P.
 
         Samples of a pixel that meet the same surface are shaded once, at their mean and for the area
@@ -141,8 +141,8 @@ class City:
         count = np.bincount(group, minlength=len(first)).astype(np.float32)
         # Tone mapping each group keeps edges against bright surfaces smooth.
         display = _tone(self._color(view, surface[first], samples, group, count))
-        display *= count / np.float32(len(_SAMPLES))
-        size = len(pixels) // len(_SAMPLES)
+        display *= count / np.float32(len(SAMPLES))
+        size = len(pixels) // len(SAMPLES)
         return np.stack([np.bincount(first % size, channel, size) for channel in display])
 
     def _share(self, surface: Ints) -> tuple[Ints, Ints]:
@@ -151,11 +151,11 @@ class City:
         A group has the samples of a pixel that see the same surface; surfaces [4 P]. The ground
         is one surface with hard edges between its parts, so its upper and lower two samples stay apart.
         """
-        keys = surface.reshape(len(_SAMPLES), -1).copy()
+        keys = surface.reshape(len(SAMPLES), -1).copy()
         lower = keys[2:]
         lower[self.mesh.material[lower] == mesh.GROUND] = -2
         leader = np.arange(keys.size, dtype=np.int32).reshape(keys.shape)
-        for k in range(1, len(_SAMPLES)):
+        for k in range(1, len(SAMPLES)):
             for earlier in reversed(range(k)):
                 np.copyto(leader[k], leader[earlier], where=keys[k] == keys[earlier])
         leaders = leader.ravel()

@@ -14,14 +14,20 @@ import cv2
 import numpy as np
 import pytest
 import scenes
+import surface_city
 import torch
 from scenes import aerial
 
+from blitzgs import rasterization
 from blitzgs.distributed.group import Ranks
+from blitzgs.formats.ply import read_ply
 from blitzgs.formats.tiles import write_tiles
 from blitzgs.runs import run_files
 from blitzgs.training import setup
 from blitzgs.training.trainer import Trainer
+from blitzgs_synth.flight import plan_flight
+from blitzgs_synth.plan import PRESETS, Plan
+from blitzgs_synth.render import City
 from tests.formats.test_tiles import SCENE, city
 from tests.helpers import DEVICES, needs_cuda, refused
 from tests.training.tiny import tiny_config, tiny_scene, write_tiny_capture
@@ -61,6 +67,24 @@ def test_the_loop_learns_with_each_arm(tmp_path, capsys):
     assert abs(one["PSNR, dB"] - four["PSNR, dB"]) < 0.5
     assert "gsplat's loop, 60 steps of tiny, autograd in one thread" in capsys.readouterr().out
     assert (tmp_path / "found.json").exists()
+
+
+def test_a_city_of_surfaces_looks_like_its_photographs(tmp_path):
+    surface_city.main([str(tmp_path / "city.ply"), "--preset=demo", "--millions=0.1", "--processes=1"])
+    model = read_ply(tmp_path / "city.ply")
+    assert 90_000 < len(model.means) <= 100_020 and model.means[:, :2].abs().max() < 0.75 * 150
+    options = PRESETS["demo"]
+    view = plan_flight(options)[7]
+    viewmat = torch.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = torch.from_numpy(view.rotation), torch.from_numpy(view.translation)
+    K = torch.tensor([[view.focal, 0, view.width / 2], [0, view.focal, view.height / 2], [0, 0, 1]])
+    colors, alphas, _ = rasterization(
+        model.means, model.quats, model.scales.exp(), model.opacities.sigmoid(), model.sh,
+        viewmat[None], K[None].float(), view.width, view.height, sh_degree=3,
+    )  # fmt: skip
+    photograph = torch.from_numpy(City(Plan(options)).render(view)) / 255
+    both = torch.stack((colors[0].mean(-1), photograph.mean(-1)))[:, alphas[0, ..., 0] > 0.5]
+    assert alphas.mean() > 0.9 and torch.corrcoef(both)[0, 1] > 0.6
 
 
 def test_nearer_frames_load_more_and_small_errors_show_everything(tmp_path, capsys):
