@@ -189,13 +189,15 @@ def main(arguments: list[str]) -> int:
         kernel = kernel_of(name)
         if kernel is not None:
             times.setdefault(kernel, []).append(count)
-    missing = 0
+    missing = []
     for kernel, path in kernels_in_source().items():
         counted = times.pop(kernel, [])
-        missing += not counted
+        missing += [] if counted else [kernel[0]]
         print(f"{sum(counted):7d} launches, {len(counted):2d} variants: {kernel[0]} ({path})")
-    print(f"not in the sources: {sorted(times)}" if times else f"{missing} kernels were not launched")
-    return status or int(missing > 0 or bool(times))
+    print(
+        f"not in the sources: {sorted(times)}" if times else f"not launched: {', '.join(missing) or 'none'}"
+    )
+    return status or int(bool(missing or times))
 
 
 if __name__ == "__main__":
