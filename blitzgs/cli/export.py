@@ -155,6 +155,8 @@ def run(args: argparse.Namespace) -> int:
     """Export a model; returns the exit status."""
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise ValueError("export writes one file from one process: run it without torchrun")
+    if args.clean is None:
+        _refuse(args, ("data",), "is for --clean, which compares with the photographs")
     with ending_by_exception():
         if args.tiles or args.streamed_sog:
             return _export_tiles(args, _selection(args))

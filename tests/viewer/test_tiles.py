@@ -193,6 +193,7 @@ def test_a_file_is_written_as_tiles_and_flags_choose(tmp_path, capsys, failure):
         (["--tiles", str(tmp_path / "t")], "is not an empty folder"),
         (["--tiles", str(tmp_path / "u"), "--max-mb", "3"], "--max-mb is not for --tiles"),
         (["--ply", str(tmp_path / "u.ply"), "--processes", "3"], "--processes is for --tiles"),
+        (["--ply", str(tmp_path / "u.ply"), "--data", "nope"], "--data is for --clean"),
         (["--streamed-sog", str(tmp_path / "u"), "--spz-tiles"], "--spz-tiles is for --tiles"),
     ):
         assert reason in failure("export", tmp_path / "m.ply", *flags)
