@@ -166,24 +166,38 @@ void share_rows_(const Tensor& opacities_in, const Tensor& scales, const std::ve
   const auto rows = checked<std::int64_t>(kOp, "rows", rows_in, {-1});
   const std::int64_t n = rows.size(0);
   const auto copies = checked<std::int64_t>(kOp, "copies", copies_in, {n});
-  const ShareRows shared{opacities, checked_in_place<float>(kOp, "scales", scales, {count, 3}),
-                         rows,      copies,
-                         n,         static_cast<float>(least)};
+  constexpr std::size_t kParameters = ShareMoments::kColumns + 1, kOpacity = 3;
+  BLITZGS_CHECK(moments.size() == 2 * kParameters, kOp, "there must be ", 2 * kParameters, " moments, got ",
+                moments.size());
 #ifdef BLITZGS_BACKEND_CUDA
   constexpr int kLanes = 16;
 #else
   constexpr int kLanes = 1;
 #endif
-  ShareMoments scaled{shared, {}, kLanes, n * kLanes};
-  BLITZGS_CHECK(moments.size() == ShareMoments::kColumns, kOp, "there must be ", ShareMoments::kColumns,
-                " moments, got ", moments.size());
-  for (int c = 0; c < ShareMoments::kColumns; ++c) {
+  ShareMoments scaled{{}, {}, rows, copies, kLanes, n * kLanes};
+  float* of_opacity[2];
+  for (std::size_t c = 0; c < moments.size(); ++c) {
     check_dtype(kOp, "a moment", moments[c], ScalarType::Float);
     check_written(kOp, "a moment", moments[c], rows);
     BLITZGS_CHECK(moments[c].size(0) == count, kOp, "a moment must have ", count, " rows, got ",
                   shape_of(moments[c]));
-    scaled.moments[c] = {mutable_data<float>(moments[c]), static_cast<int>(elements_behind(moments[c]))};
+    float* const values = mutable_data<float>(moments[c]);
+    const std::size_t parameter = c % kParameters, order = c / kParameters;
+    if (parameter == kOpacity) {
+      of_opacity[order] = values;
+    } else {
+      auto& columns = order == 0 ? scaled.avgs : scaled.avg_sqs;
+      columns[parameter - (parameter > kOpacity)] = {values, static_cast<int>(elements_behind(moments[c]))};
+    }
   }
+  const ShareRows shared{opacities,
+                         checked_in_place<float>(kOp, "scales", scales, {count, 3}),
+                         of_opacity[0],
+                         of_opacity[1],
+                         rows,
+                         copies,
+                         n,
+                         static_cast<float>(least)};
   DeviceScope scope(opacities);
   backend::for_each_row(scaled, scope.stream);
   backend::for_each_row(shared, scope.stream);

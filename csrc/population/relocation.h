@@ -69,65 +69,65 @@ struct Overlap {
 
 // Lets rows of a table stand for N copies each: opacities and scales are shared (the logits and logarithms of
 // o' = 1 - (1 - o)^(1/N) and s' = s o / overlap(o', N)), and Adam's moments are scaled as the gradients are.
+//
+// Each of N Gaussians in one place has 1/N of the gradient of the Gaussian before. That of the logit changes
+// by the factor o' / o, since (1 - o')^N = 1 - o. Second moments change by the squares.
 struct ShareRows {
   float* opacities;            // [N], logits
   float* scales;               // [N, 3], logarithms
+  float* opacity_avgs;         // [N], first moments of the logits
+  float* opacity_avg_sqs;      // [N], second moments
   const std::int64_t* rows;    // [n], each once
   const std::int64_t* copies;  // [n], the row itself included
   std::int64_t n;
   float least;  // sharing does not reduce a logit below this
 
-  // -log(1 - o) / N: the part of it that each of the copies has.
-  BLITZGS_HD double depth(double logit, std::int64_t i) const {
-    // -log(1 - o) = softplus(logit)
-    return (std::log1p(std::exp(-std::fabs(logit))) + larger(logit, 0.0)) / static_cast<double>(copies[i]);
-  }
-
-  BLITZGS_HD float shared_logit(double depth) const {
-    return larger(static_cast<float>(std::log(std::expm1(depth))), least);
-  }
-
   BLITZGS_HD void operator()(std::int64_t i) const {
     const std::int64_t row = rows[i];
-    const double logit = opacities[row], part = depth(logit, i);
-    // log(o) = -softplus(-logit)
-    const double log_opacity = -(std::log1p(std::exp(-std::fabs(logit))) + larger(-logit, 0.0));
-    const double factor = log_opacity - std::log(overlap_of(-std::expm1(-part), copies[i]));
-    opacities[row] = shared_logit(part);
+    const double logit = opacities[row], count = static_cast<double>(copies[i]);
+    const double log_complement = std::log1p(std::exp(-std::fabs(logit)));
+    // -log(1 - o) = softplus(logit), and log(o) = -softplus(-logit).
+    const double depth = (log_complement + larger(logit, 0.0)) / count;
+    const double log_opacity = -(log_complement + larger(-logit, 0.0));
+    const double factor = log_opacity - std::log(overlap_of(-std::expm1(-depth), copies[i]));
+    const float shared = larger(static_cast<float>(std::log(std::expm1(depth))), least);
+    opacities[row] = shared;
     for (int axis = 0; axis < 3; ++axis) {
       float& scale = scales[3 * row + axis];
       scale = static_cast<float>(scale + factor);
     }
+    const double dimmed = sigmoid(static_cast<double>(shared)) / sigmoid(logit);
+    opacity_avgs[row] *= static_cast<float>(dimmed);
+    opacity_avg_sqs[row] *= static_cast<float>(dimmed * dimmed);
   }
 };
 
-// Scales the moments of rows before ShareRows shares their opacities.
-//
-// Each of N Gaussians in one place has 1/N of the gradient of the Gaussian before. That of the logit changes
-// by the factor o' / o, since (1 - o')^N = 1 - o. Second moments change by the squares. On CUDA, neighbouring
-// threads scale neighbouring values of a row.
+// Scales the moments of all parameters but the opacity by 1/N and 1/N^2. On CUDA, neighbouring threads scale
+// neighbouring values of a row.
 struct ShareMoments {
-  static constexpr int kColumns = 10;  // first moments of all parameters, then second moments
+  static constexpr int kColumns = 4;  // of first moments, and of second ones
   struct Moments {
     float* values;  // [N, width]
     int width;
   };
-  ShareRows rows;
-  Moments moments[kColumns];  // the fourth parameter is the opacity
-  int lanes;                  // threads of a row
-  std::int64_t n;             // rows times lanes
+  Moments avgs[kColumns], avg_sqs[kColumns];
+  const std::int64_t* rows;    // [n / lanes]
+  const std::int64_t* copies;  // [n / lanes]
+  int lanes;                   // threads of a row
+  std::int64_t n;
 
   BLITZGS_HD void operator()(std::int64_t item) const {
-    const std::int64_t i = item / lanes, row = rows.rows[i];
-    const double logit = rows.opacities[row], share = 1 / static_cast<double>(rows.copies[i]);
-    const double dimmed =
-        sigmoid(static_cast<double>(rows.shared_logit(rows.depth(logit, i)))) / sigmoid(logit);
+    const std::int64_t row = rows[item / lanes];
+    const double share = 1 / static_cast<double>(copies[item / lanes]);
     for (int c = 0; c < kColumns; ++c) {
-      const double by = c % 5 == 3 ? dimmed : share;
-      const float factor = static_cast<float>(c < 5 ? by : by * by);
-      float* const values = moments[c].values + row * moments[c].width;
-      for (int k = static_cast<int>(item % lanes); k < moments[c].width; k += lanes) values[k] *= factor;
+      scale(avgs[c], row, item % lanes, static_cast<float>(share));
+      scale(avg_sqs[c], row, item % lanes, static_cast<float>(share * share));
     }
+  }
+
+  BLITZGS_HD void scale(const Moments& moments, std::int64_t row, std::int64_t lane, float factor) const {
+    float* const values = moments.values + row * moments.width;
+    for (auto k = static_cast<int>(lane); k < moments.width; k += lanes) values[k] *= factor;
   }
 };
 
