@@ -103,7 +103,7 @@ class LodConfig:
 FORK = 2.0
 
 # The largest factor by which `schedule.images_per_view` makes a run longer.
-MAX_STRETCH = 4.0
+MAX_STRETCH = 10.0
 
 # The share of the position rate that is left in the end, and that of the rate of `sh_dc` for other SH.
 POSITION_LEFT, SH_SHARE = 0.01, 0.05
