@@ -9,15 +9,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from blitzgs.capture.colmap import camera_models
+from blitzgs.capture.fields import Fields, number
 from blitzgs.capture.image_files import read_header
 from blitzgs.capture.lens import Lens
-
-Fields = Mapping[str, Any]
 
 _FISHEYE = "OPENCV_FISHEYE"
 # What these names mean differs between programs by which coefficients are zero only: nerfstudio's converters
@@ -59,21 +57,6 @@ def read_lens(root: Fields, frame: Fields, path: Path, notes: dict[str, None]) -
     name = _model_name(root, frame)
     model = _GENERAL.get(name, name)
     return Lens(model, width, height, (*focal, *centre, *_coefficients(merged, name, model, notes)))
-
-
-def number(fields: Fields, key: str, default: float | None = None) -> float:
-    """Return a field that must be a finite number (as text too), or a default; ValueError names it."""
-    value = fields.get(key, default)
-    try:
-        if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-            raise ValueError
-        converted = float(value)
-    except (ValueError, OverflowError):
-        converted = math.nan
-    if not math.isfinite(converted):
-        shown = "null" if value is None else f"{value!r:.40}"
-        raise ValueError(f"{key} must be a finite number, got {shown}")
-    return converted
 
 
 def _size(fields: Fields, path: Path) -> tuple[int, int]:

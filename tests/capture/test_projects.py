@@ -274,7 +274,7 @@ def opf_that_leads_outside(root):
         ),
         (
             edited(files.metashape, "c.xml", "<f>81.5</f>", "<f>nan</f>"),
-            "sensor 7: f: expected a finite number",
+            "sensor 7: f must be a finite number, got 'nan'",
         ),
         (
             edited(files.metashape, "c.xml", 'height="72"/>\n<f>', 'height="1e9"/>\n<f>'),
@@ -286,7 +286,7 @@ def opf_that_leads_outside(root):
         ),
         (
             edited(files.realitycapture, "r.csv", "DJI_0001.JPG,", "DJI_0001.JPG,x"),
-            "line 4: x: expected numbers",
+            "line 4: x must be a finite number",
         ),
         (edited(files.realitycapture, "r.csv", "DJI_0001.JPG,", ""), "line 4: 15 values in 16 columns"),
         (cut_bundle, "bundle.out: 100 lines are too few for 7 cameras and 40 points"),
