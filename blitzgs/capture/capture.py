@@ -36,14 +36,13 @@ from blitzgs.capture.masks import FindDamage, check_mask_sizes, check_masks, dam
 from blitzgs.capture.names import MissingImagesError as MissingImagesError
 from blitzgs.capture.names import check_inside, existing, relative_to, to_convert
 from blitzgs.capture.projects.find import FoundProject, folder_of, project_at
+from blitzgs.capture.splits import split_views, without_unused
 from blitzgs.capture.usable import (
     check_lenses,
     finite_points,
     points_at_random,
-    split_capture,
     with_finite_poses,
     without_strays,
-    without_unused,
 )
 from blitzgs.config.ranges import CHOICES
 from blitzgs.util.errors import check_number, located, warn
@@ -110,7 +109,7 @@ def load_capture(
         downscale: reduce both sides of the camera model's size by this factor. A folder such as images_4 is
             used for 4 if it contains every image at the right size; otherwise images are downscaled by
             averaging areas when they are decoded.
-        split: see `usable.split_views`: n, "val", a list file, or "auto" (the split of the files, or every
+        split: see `splits.split_views`: n, "val", a list file, or "auto" (the split of the files, or every
             8th view).
         masks: folder of masks (NAME.png or STEM.png; black = excluded). None uses `masks/` when it exists;
             True requires it; False uses none.
@@ -145,7 +144,7 @@ def load_capture(
     views = sorted(with_finite_poses(views), key=lambda view: view.name)
     points = finite_points(points)
     # Use all views, so that a photograph that is lost later changes neither the origin nor the split.
-    train, test, why = split_capture(views, root, split)
+    train, test, why = split_views(views, root, split)
     apart, strays = find_apart(views, points.positions)
     centres = camera_centres(np.stack([view.world_to_camera for view in views]))
     offset = centres[~apart].mean(axis=0)

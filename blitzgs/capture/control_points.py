@@ -6,15 +6,15 @@ from __future__ import annotations
 import csv
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
 from blitzgs.capture.cameras import Camera, Float64, camera_centres
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.names import unified
+from blitzgs.capture.names import any_case, by_parts
 from blitzgs.capture.world import WorldFrame, fit_similarity, read_small, utm_of_text
 
 # The least angle between two rays to a point, in degrees: below it, its distance is unknown.
@@ -111,9 +111,11 @@ def place(points: Sequence[ControlPoint], cameras: Sequence[Camera], origin: Flo
 
     The cameras are those of a capture that was loaded without downscaling, `origin` is its `Capture.offset`.
     """
-    by_name, found = _by_name(cameras), []
+    known, found = by_parts(camera.name for camera in cameras), []
+    # The marks have names without folders; they count where one camera is called so.
+    by_name = {key: cameras[some[0]] for key, some in known.items() if len(some) == 1}
     for point in points:
-        marks = [(by_name.get(_key(image)), image, x, y) for image, x, y in point.marks]
+        marks = [(by_name.get(any_case(mark[0]).rpartition("/")[2]), *mark) for mark in point.marks]
         placed = replace(point, seen=[(camera, x, y) for camera, _, x, y in marks if camera is not None])
         found.append(placed)
         if len({camera.name for camera, _, _ in placed.seen}) < 2:
@@ -126,19 +128,6 @@ def place(points: Sequence[ControlPoint], cameras: Sequence[Camera], origin: Flo
         except ValueError as error:
             placed.problem = str(error)
     return found
-
-
-def _key(name: str) -> str:
-    return PurePosixPath(unified(name).casefold()).name
-
-
-def _by_name(cameras: Sequence[Camera]) -> Mapping[str, Camera]:
-    """Return the cameras by their names without folders, with and without suffix, where these are unique."""
-    named: dict[str, list[Camera]] = {}
-    for camera in cameras:
-        for key in {_key(camera.name), PurePosixPath(_key(camera.name)).stem}:
-            named.setdefault(key, []).append(camera)
-    return {key: some[0] for key, some in named.items() if len(some) == 1}
 
 
 def normalised(lens: Lens, x: float, y: float) -> Float64:

@@ -40,17 +40,28 @@ def relative_to(root: Path, path: Path) -> Path:
     return path.relative_to(root) if path.is_relative_to(root) else path
 
 
-def _any_case(name: str) -> str:
+def any_case(name: str) -> str:
+    """Return a path as `unified` does, in lower case."""
     return unified(name).casefold()
 
 
+def by_parts(names: Iterable[str]) -> dict[str, list[int]]:
+    """Return the indices of names by their lower-case forms with and without folders and suffix."""
+    found = defaultdict(list)
+    for index, name in enumerate(names):
+        path = PurePosixPath(any_case(name))
+        for key in {str(path), str(path).removesuffix(path.suffix), path.name, path.stem}:
+            found[key].append(index)
+    return found
+
+
 def _without_suffix(name: str) -> str:
-    path = PurePosixPath(_any_case(name))
+    path = PurePosixPath(any_case(name))
     return str(path.with_suffix("")) if path.suffix in IMAGE_SUFFIXES + _CONVERTED_SUFFIXES else str(path)
 
 
 def _last(name: str) -> str:
-    return PurePosixPath(_any_case(name)).name
+    return PurePosixPath(any_case(name)).name
 
 
 # What is ignored, and whether files that were found by stricter rules rule it out: where some photographs are
@@ -58,10 +69,10 @@ def _last(name: str) -> str:
 _Rule = tuple[str, Callable[[str], str], bool]
 _RULES: tuple[_Rule, ...] = (
     ("slashes and composed letters", unified, False),
-    ("upper and lower case", _any_case, False),
+    ("upper and lower case", any_case, False),
     ("suffixes", _without_suffix, True),
     ("folders", _last, True),
-    ("folders that became part of the name", lambda name: _any_case(name).replace("/", "_"), True),
+    ("folders that became part of the name", lambda name: any_case(name).replace("/", "_"), True),
     ("folders and suffixes", lambda name: _without_suffix(_last(name)), True),
 )
 

@@ -9,37 +9,44 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from blitzgs.capture.cameras import SourceView
 from blitzgs.capture.capture import load_capture
-from blitzgs.capture.usable import split_views
+from blitzgs.capture.splits import split_views
 from tests.capture.helpers import reconstruction, smooth_image, write_capture, write_image
 from tests.helpers import look_at_origin, refused
 
 NAMES = ["a/1.jpg", "a/2.jpg", "b/1.jpg", "b/3.jpg"]
 ROOT = Path("/capture")
-PATHS = [ROOT / "images" / name for name in NAMES]
+
+
+def split(root, spec="auto", names=NAMES, paths=None):
+    """Train and test views of these names, whose images are in /capture/images or have these paths."""
+    paths = paths or [ROOT / "images" / name for name in names]
+    views = [SourceView(name, path, None, None, None) for name, path in zip(names, paths, strict=True)]
+    return split_views(views, root, spec)[:2]
 
 
 @pytest.mark.parametrize(("spec", "test"), [(2, [0, 2]), ("3", [0, 3]), (0, []), ("auto", [0])])
 def test_every_nth_view_is_held_out(spec, test):
-    train, found = split_views(NAMES, PATHS, ROOT, spec)
+    train, found = split(ROOT, spec)
     assert found == test and sorted(train + found) == [0, 1, 2, 3]
 
 
 def test_list_file_matches_names_file_names_and_stems(tmp_path):
     # A byte order mark, as of editors on Windows, is no part of the first line.
     (tmp_path / "test.txt").write_bytes(b"\xef\xbb\xbfa\\1.jpg\r\n# held out\n\n2.jpg  # by file name\n3\n")
-    assert split_views(NAMES, PATHS, tmp_path, "test.txt") == ([2], [0, 1, 3])
-    assert split_views(NAMES, PATHS, ROOT, tmp_path / "test.txt") == ([2], [0, 1, 3])
+    assert split(tmp_path, "test.txt") == ([2], [0, 1, 3])
+    assert split(ROOT, tmp_path / "test.txt") == ([2], [0, 1, 3])
 
 
 def test_a_list_file_may_have_names_that_are_not_utf_8(tmp_path):
     (tmp_path / "test.txt").write_bytes(b"\xfc.jpg\n")
     names = ["1.jpg", "\udcfc.jpg"]
-    assert split_views(names, [tmp_path / name for name in names], tmp_path, "test.txt") == ([0], [1])
+    assert split(tmp_path, "test.txt", names) == ([0], [1])
 
 
 def test_a_name_without_parts_is_split_like_any_other(tmp_path):
-    assert split_views([".", "1.jpg"], [tmp_path, tmp_path / "1.jpg"], tmp_path) == ([1], [0])
+    assert split(tmp_path, names=[".", "1.jpg"]) == ([1], [0])
 
 
 @pytest.mark.parametrize(
@@ -52,24 +59,24 @@ def test_a_name_without_parts_is_split_like_any_other(tmp_path):
 )
 def test_list_entries_must_name_one_view(tmp_path, line, message):
     (tmp_path / "test.txt").write_text(line)
-    refused(ValueError, message, split_views, NAMES, PATHS, tmp_path, "test.txt")
+    refused(ValueError, message, split, tmp_path, "test.txt")
 
 
 def test_val_folder_is_used_when_it_is_there():
     paths = [ROOT / ("val" if i == 2 else "train") / "rgbs" / f"{i}.jpg" for i in range(4)]
-    assert split_views(NAMES, paths, ROOT, "auto") == ([0, 1, 3], [2])
-    assert split_views(NAMES, paths, ROOT, "val") == ([0, 1, 3], [2])
-    refused(ValueError, "no view's image is in /capture/val", split_views, NAMES, PATHS, ROOT, "val")
+    assert split(ROOT, paths=paths) == ([0, 1, 3], [2])
+    assert split(ROOT, "val", paths=paths) == ([0, 1, 3], [2])
+    refused(ValueError, "no view's image is in /capture/val", split, ROOT, "val")
 
 
 def test_invalid_splits_are_refused(tmp_path):
     for number in (1, "-1"):
         message = f"data.split: must be 0 .no view is held out. or at least 2, got {number}"
-        refused(ValueError, message, split_views, NAMES, PATHS, ROOT, number)
+        refused(ValueError, message, split, ROOT, number)
     with pytest.raises(ValueError, match=r"must be a whole number n .*, 'auto', 'val' or a file"):
-        split_views(NAMES, PATHS, ROOT, "missing.txt")
+        split(ROOT, "missing.txt")
     (tmp_path / "all.txt").write_text("\n".join(NAMES))
-    refused(ValueError, "leaves no training view of 4", split_views, NAMES, PATHS, tmp_path, "all.txt")
+    refused(ValueError, "leaves no training view of 4", split, tmp_path, "all.txt")
 
 
 pytestmark = [
@@ -167,7 +174,7 @@ def test_the_files_of_blenders_split_are_all_read(tmp_path, parts):
     for part in parts:
         write(tmp_path, f"transforms_{part}.json", names[part])
     if "train" not in parts:
-        refused(ValueError, "hold out every view", load_capture, tmp_path)
+        refused(ValueError, "the capture's own split leaves no training view of", load_capture, tmp_path)
         return
     train, test, capture = split_of(tmp_path)
     assert train == names["train"] and test == [

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from typing import NamedTuple
 from blitzgs.capture.cameras import SourceView
 from blitzgs.capture.image_files import read_header
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.names import IMAGE_SUFFIXES, files_below, find_images, unified
+from blitzgs.capture.names import IMAGE_SUFFIXES, any_case, by_parts, files_below, find_images, unified
 from blitzgs.capture.points import SUFFIXES, SourcePoints, file_points
 from blitzgs.capture.projects import Project
 from blitzgs.capture.projects.metashape import is_metashape, read_metashape
@@ -134,15 +134,11 @@ def _with_suffixes(folder: Path, root: Path, names: Sequence[str]) -> list[str]:
     if all(PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES for name in names):
         return list(names)
     base = folder if folder.is_dir() else root
-    stems: defaultdict[str, list[str]] = defaultdict(list)
-    for file in files_below(base):
-        path = PurePosixPath(file)
-        if path.suffix.lower() in IMAGE_SUFFIXES:
-            for key in {str(path.with_suffix("")), path.stem}:
-                stems[key].append(file)
-    found = []
+    files = [file for file in files_below(base) if PurePosixPath(file).suffix.lower() in IMAGE_SUFFIXES]
+    known, found = by_parts(files), []
     for name in names:
-        fits = [] if PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES else stems.get(name, [])
+        has_suffix = PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES
+        fits = [] if has_suffix else [files[index] for index in known.get(any_case(name), [])]
         fits = [file for file in fits if str(PurePosixPath(file).with_suffix("")) == name] or fits
         if len(fits) > 1:
             shown = ", ".join(fits[:3])
