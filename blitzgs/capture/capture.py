@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,7 +27,7 @@ from blitzgs.capture.cameras import (
     same_shape,
     scaled_matrix,
 )
-from blitzgs.capture.image_files import ImageHeader, read_header
+from blitzgs.capture.image_files import ImageHeader, in_threads, read_header
 from blitzgs.capture.layouts import About, read_layout
 from blitzgs.capture.lengths import blind_views, find_apart, measured_extent, near_plane, nearest_depths
 from blitzgs.capture.lens import Lens
@@ -49,7 +48,6 @@ from blitzgs.util.errors import check_number, located, warn
 
 # In pixels. SSIM compares windows of 11 pixels, and a much smaller image shows too little to train on.
 _LEAST_SIDE = 8
-_HEADER_THREADS = 16
 
 
 @dataclass(eq=False)
@@ -221,8 +219,7 @@ def _check_options(downscale: float, exif: str, undistort: str, stray_cameras: s
 
 def _headers(views: list[SourceView]) -> list[ImageHeader]:
     """Read the headers of the photographs and check their masks; warn of bands that are not used."""
-    with ThreadPoolExecutor(_HEADER_THREADS) as pool:  # the files may be on a slow network disk
-        headers = list(pool.map(lambda view: read_header(view.path), views))
+    headers = in_threads(read_header, [view.path for view in views])
     check_masks([view.mask_path for view in views])
     extra_bands = [view.name for view, header in zip(views, headers, strict=True) if header.extra_bands]
     if extra_bands:

@@ -42,10 +42,11 @@ from blitzgs.capture.image_files import (
     reduced,
     reduced_mask,
 )
-from blitzgs.capture.masks import FileCheck, mask_error, misfit
+from blitzgs.capture.masks import FileCheck, misfit
 from blitzgs.capture.shared_images import BoundedCache as BoundedCache
 from blitzgs.capture.shared_images import SharedImages
 from blitzgs.formats import native
+from blitzgs.util.errors import located
 from blitzgs.util.terminal import amount
 
 DEFAULT_BUDGET = 4 << 30
@@ -195,12 +196,8 @@ class ImageStore:
         """
         test = set(self.capture.test)
         order = sorted(indices, key=lambda index: index not in test)
-        self._check = FileCheck(self.capture.cameras, order, self._has_counted, self._whole_jpegs)
+        self._check = FileCheck([self.capture.cameras[index] for index in order], self._whole_jpegs)
         return self._check
-
-    def _has_counted(self, camera: Camera) -> bool:
-        assert camera.mask_path is not None
-        return bool(self._file_mask(camera, camera.mask_path).any())
 
     def close(self) -> None:
         """Stop the threads; images whose decoding has not begun are not decoded."""
@@ -336,10 +333,8 @@ class ImageStore:
 
     def _file_mask(self, camera: Camera, path: Path) -> UInt8:
         lens = camera.rectification.lens
-        try:
+        with located("the mask"):
             mask = decode_mask(self._read(path))
-        except ValueError as error:
-            raise mask_error(error) from error
         stored = (lens.width, lens.height) if camera.orientation < 5 else (lens.height, lens.width)
         if (mask.shape[1], mask.shape[0]) == stored:
             mask = apply_orientation(mask, camera.orientation)

@@ -6,25 +6,22 @@ from __future__ import annotations
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Container, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from itertools import product
 from pathlib import Path, PurePosixPath
 
 from blitzgs.capture.cameras import Camera, same_shape
-from blitzgs.capture.image_files import check_photograph, decode_mask, read_header, read_whole
-from blitzgs.capture.names import files_below, unified, what_is_at
-from blitzgs.util.errors import warn
+from blitzgs.capture.image_files import check_photograph, decode_mask, in_threads, read_header, read_whole
+from blitzgs.capture.names import IMAGE_SUFFIXES, files_below, unified, what_is_at
+from blitzgs.util.errors import located, warn
 
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".gif", ".webp", ".avif", ".jp2")
 # What programs call the mask of a.jpg, the names that are tried first first.
 _FORMS: tuple[str, ...] = ("{name}.png", "{stem}.png", "{name}", "{stem}_mask.png", "{stem}_mask{suffix}")
 _FORMS += ("{name}_mask.png", "{name}.mask.png", "{stem}.mask.png")
 # These with another suffix, after all others.
 _FORMS_OF_ANY_SUFFIX = ("{name}", "{stem}", "{stem}_mask")
-_FORMS_OF_A_PLACE = len(_FORMS) + 1 + len(_FORMS_OF_ANY_SUFFIX) * len(_SUFFIXES[1:])
+_FORMS_OF_A_PLACE = len(_FORMS) + 1 + len(_FORMS_OF_ANY_SUFFIX) * len(IMAGE_SUFFIXES)
 # Masks are decoded when the capture is loaded to see what they exclude.
 _SAMPLED = 8
-_THREADS = 16
 
 
 def find_masks(
@@ -51,7 +48,7 @@ def find_masks(
         if masks is not None:
             raise FileNotFoundError(f"{folder}: no such folder of masks")
         return list(given)
-    files = [name for name in files_below(folder) if PurePosixPath(name).suffix.lower() in _SUFFIXES]
+    files = [name for name in files_below(folder) if PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES]
     owners = _owners(folder, files, [None if path else name for name, path in zip(names, given, strict=True)])
     found = [
         path if path is not None or index not in owners else folder / owners[index]
@@ -127,7 +124,7 @@ def _places(name: str) -> Iterator[str]:
         for form in (_FORMS[0], "{name}" if path.suffix.lower() == ".png" else "", *_FORMS[1:]):
             own = form.format(name=path.name, stem=path.stem, suffix=path.suffix)
             yield "/".join((*parts[begin:-1], own))
-        for form, suffix in product(_FORMS_OF_ANY_SUFFIX, _SUFFIXES[1:]):
+        for form, suffix in product(_FORMS_OF_ANY_SUFFIX, IMAGE_SUFFIXES):
             yield "/".join((*parts[begin:-1], form.format(name=path.name, stem=path.stem) + suffix))
 
 
@@ -154,8 +151,7 @@ def check_mask_sizes(cameras: Sequence[Camera]) -> None:
             return None
         return None if header is None else misfit(camera, header.width, header.height)
 
-    with ThreadPoolExecutor(_THREADS) as pool:  # the files may be on a slow network disk
-        found = [text for text in pool.map(problem, cameras) if text is not None]
+    found = [text for text in in_threads(problem, cameras) if text is not None]
     if found:
         more = f" ({len(found)} masks do not fit)" if len(found) > 1 else ""
         raise ValueError(found[0] + more)
@@ -163,18 +159,24 @@ def check_mask_sizes(cameras: Sequence[Camera]) -> None:
 
 def check_masks(masks: Sequence[Path | None]) -> None:
     """Warn if a few of the masks exclude nothing, or everything; damaged ones are left to who needs them."""
+
+    def counted_share(path: Path) -> float | None:
+        try:
+            return float(decode_mask(read_whole(path)).mean())
+        except (OSError, ValueError):
+            return None
+
     paths = [path for path in dict.fromkeys(masks) if path is not None]
     sample = [paths[i * len(paths) // min(_SAMPLED, len(paths))] for i in range(min(_SAMPLED, len(paths)))]
-    with ThreadPoolExecutor(_SAMPLED) as pool:
-        shares = [share for share in pool.map(_share, sample) if share is not None]
+    shares = [share for share in in_threads(counted_share, sample) if share is not None]
     if not shares:
         return
-    if max(shares) == 0:
+    if min(shares) == 1:
         warn(
             f"the masks exclude nothing ({len(shares)} of {len(paths)} were looked at; first: {sample[0]}): "
             "black or transparent pixels are excluded, all others count"
         )
-    elif min(shares) == 1:
+    elif max(shares) == 0:
         warn(
             f"the masks exclude every pixel ({len(shares)} of {len(paths)} were looked at; first: "
             f"{sample[0]}): black or transparent pixels are excluded, and in lossy files (JPEG) dark ones "
@@ -182,28 +184,20 @@ def check_masks(masks: Sequence[Path | None]) -> None:
         )
 
 
-def _share(path: Path) -> float | None:
-    try:
-        return 1.0 - float(decode_mask(read_whole(path)).mean())
-    except (OSError, ValueError):
-        return None
+def check_files(photograph: Path, mask: Path | None, is_whole: bool = False) -> bool:
+    """Check that a photograph and its mask can be decoded, and tell whether some pixel counts.
+
+    `is_whole`: the photograph is opaque and was checked before. ValueError, OSError: one cannot be decoded.
+    """
+    has_pixels = is_whole or check_photograph(photograph)
+    if mask is None:
+        return has_pixels
+    with located("the mask"):
+        return bool(decode_mask(read_whole(mask)).any()) and has_pixels
 
 
 # Returns what is wrong with photographs and their masks, as `damaged` does.
 FindDamage = Callable[[Sequence[tuple[Path, Path | None]]], dict[int, str]]
-
-
-def mask_error(error: Exception) -> ValueError:
-    """Return an error that says that the file is a mask."""
-    return ValueError(f"the mask {error}")
-
-
-def read_mask_file(path: Path) -> None:
-    """Decode a mask (ValueError: it is damaged; says that it is a mask)."""
-    try:
-        decode_mask(read_whole(path))
-    except ValueError as error:
-        raise mask_error(error) from error
 
 
 def damaged(files: Sequence[tuple[Path, Path | None]]) -> dict[int, str]:
@@ -211,35 +205,22 @@ def damaged(files: Sequence[tuple[Path, Path | None]]) -> dict[int, str]:
 
     def problem(pair: tuple[Path, Path | None]) -> str | None:
         try:
-            check_photograph(pair[0])
-            if pair[1] is not None:
-                read_mask_file(pair[1])
+            check_files(*pair)
         except (OSError, ValueError) as error:
             return str(error)
         return None
 
-    with ThreadPoolExecutor(_THREADS) as pool:
-        return {i: text for i, text in enumerate(pool.map(problem, files)) if text is not None}
+    return {i: text for i, text in enumerate(in_threads(problem, files)) if text is not None}
 
 
 class FileCheck:
     """Checks the files of views one after the other in a thread of its own, while others are in use."""
 
-    def __init__(
-        self,
-        cameras: Sequence[Camera],
-        order: Sequence[int],
-        counted: Callable[[Camera], bool],
-        whole: Container[Path],
-    ) -> None:
-        """Start to check files.
-
-        `counted`: decodes a view's mask, and tells whether some pixel counts. `whole`: files of opaque
-        photographs that others have checked meanwhile.
-        """
+    def __init__(self, cameras: Sequence[Camera], whole: Container[Path]) -> None:
+        """Start to check files; `whole` are those of opaque photographs that others have read meanwhile."""
         # What is wrong with the first damaged file that was found; None so far.
         self.damage: str | None = None
-        self._cameras, self._order, self._counted, self._whole = cameras, order, counted, whole
+        self._cameras, self._whole = cameras, whole
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="blitzgs-check", daemon=True)
         self._thread.start()
@@ -255,19 +236,15 @@ class FileCheck:
 
     def _run(self) -> None:
         blank = []
-        for index in self._order:
+        for camera in self._cameras:
             if self._stop.is_set():
                 return
-            camera = self._cameras[index]
             try:
-                has_pixels = camera.image_path in self._whole or check_photograph(camera.image_path)
-                if camera.mask_path is not None:
-                    has_pixels = self._counted(camera) and has_pixels
+                if not check_files(camera.image_path, camera.mask_path, camera.image_path in self._whole):
+                    blank.append(camera.name)
             except (OSError, ValueError) as error:
                 self.damage = str(error)
                 return
-            if not has_pixels:
-                blank.append(camera.name)
         if blank:
             warn(
                 f"{len(blank)} photographs have no pixel that counts, as they are transparent or masked "

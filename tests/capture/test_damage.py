@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of kinds that are not supported, and damage that is found before a file is needed."""
 
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from blitzgs.capture.image_files import (
     read_whole,
 )
 from blitzgs.capture.images import ImageStore
-from blitzgs.capture.masks import read_mask_file
+from blitzgs.capture.masks import damaged
 from tests.capture.helpers import smooth_image, tiff, write_capture, write_image
 from tests.helpers import refused
 
@@ -82,8 +84,10 @@ def test_what_is_not_supported_is_called_so_at_load(tmp_path, name, data, kind, 
 def test_files_without_an_image_are_called_what_they_are(tmp_path, data, message):
     for name in ("a.png", "a.jpg", "a.tif"):
         (tmp_path / name).write_bytes(data)
-        for reads in (read_header, check_photograph, read_mask_file):
+        for reads in (read_header, check_photograph):
             refused(ValueError, f"{name}: {message}", reads, tmp_path / name)
+        write_image(whole := tmp_path / "whole.png", smooth_image(8, 8))
+        assert re.search(f"the mask: .*{name}: {message}", damaged([(whole, tmp_path / name)])[0])
 
 
 def test_a_mask_in_separate_bands_of_16_bits_is_refused():
@@ -150,7 +154,7 @@ def test_damage_is_found_in_the_background_and_ends_every_read(tmp_path, kind, i
     store.close()
     store = ImageStore(capture)  # which has no copy of the file in memory
     store.check_files(range(9)).wait()
-    refused(ValueError, ("the mask " if kind == "mask" else "") + rf".*{index}.png: at byte", store.get, 7)
+    refused(ValueError, ("the mask: " if kind == "mask" else "") + rf".*{index}.png: at byte", store.get, 7)
     store.close()
     with pytest.warns(
         UserWarning, match=rf"1 of 9 images or their masks are damaged; dropped .*{index}.png: at"

@@ -187,7 +187,7 @@ def test_messages_about_masks_speak_of_masks(tmp_path):
     path = root / "masks" / "a.png"
     path.write_bytes(WAYS["black and white"][:-20])
     store = ImageStore(load_capture(root))
-    refused(ValueError, r"the mask .*masks/a.png: at byte \d+: truncated PNG", store.mask, 0)
+    refused(ValueError, r"the mask: .*masks/a.png: at byte \d+: truncated PNG", store.mask, 0)
 
 
 def test_a_photograph_is_not_taken_for_its_own_mask(tmp_path):
