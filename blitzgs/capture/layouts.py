@@ -17,13 +17,12 @@ from blitzgs.capture import colmap, transforms
 from blitzgs.capture.cameras import SourceView
 from blitzgs.capture.lengths import StrayCamera
 from blitzgs.capture.lens import lenses_of
-from blitzgs.capture.names import find_images, relative_to, to_convert
+from blitzgs.capture.names import IMAGE_SUFFIXES, find_images, relative_to, to_convert
 from blitzgs.capture.points import SourcePoints, file_points, transforms_points
 from blitzgs.capture.projects.find import FoundProject, find_project, read_project
 from blitzgs.capture.world import WorldFrame, frame_beside
 from blitzgs.util.errors import located, warn
 
-_PHOTOGRAPH_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 # What programs write beside the images of a synthetic capture.
 _BY_PRODUCT = re.compile(r"(?i)(depth|normal|disp|mask|alpha|segmentation)s?(_?\d+)?$")
 
@@ -115,7 +114,7 @@ def _hint(root: Path) -> str:
             f"move the model to {root / 'sparse' / '0'}"
         )
     names = [path.name for path in (*root.glob("*"), *root.glob("*/*"))]
-    if any(PurePath(name).suffix.lower() in _PHOTOGRAPH_SUFFIXES for name in names):
+    if any(PurePath(name).suffix.lower() in IMAGE_SUFFIXES for name in names):
         return (
             f"; it has images but not their cameras: blitzgs sfm {shlex.quote(str(root))} CAPTURE finds these"
         )
@@ -166,7 +165,7 @@ def _with_photographs(root: Path, about: About, views: Sequence[SourceView]) -> 
     not count; only files with the suffixes of photographs in use count, and no depths or normals beside them.
     """
     used = {view.path for view in views}
-    suffixes = {path.suffix.lower() for path in used} & set(_PHOTOGRAPH_SUFFIXES)
+    suffixes = {path.suffix.lower() for path in used} & set(IMAGE_SUFFIXES)
     folders = {path.parent for path in used}
     known = used | {view.mask_path for view in views}
     without = sorted(

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from blitzgs.capture.cameras import Float64, SourceView
-from blitzgs.capture.names import match_names
+from blitzgs.capture.names import find_files
 from blitzgs.capture.transforms_lens import FIELDS, read_lens
 
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
@@ -130,18 +130,8 @@ def _applied(file: Path, content: Mapping[str, Any]) -> Float64 | None:
 
 
 def _found(root: Path, names: Sequence[str]) -> dict[str, Path]:
-    """Return the file of each name, also if it is written in another notation (`names.match_names`)."""
-    paths = {
-        name: next((p for s in _SUFFIXES if (p := root / (name + s)).is_file()), root / _name(name))
-        for name in names
-    }
-    there = [
-        path.relative_to(root).as_posix()
-        for path in paths.values()
-        if path.is_relative_to(root) and ".." not in path.parts and path.is_file()
-    ]
-    lost = [name for name, path in paths.items() if not path.is_file()]
-    return paths | match_names(lost, there, root)
+    """Return the file of each name; a name may lack its suffix, as Blender's do."""
+    return find_files(names, lambda name: (root / (_name(name) + suffix) for suffix in _SUFFIXES), root)
 
 
 def _read_file(path: Path) -> tuple[dict[str, Any], list[Any]]:
