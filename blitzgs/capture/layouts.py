@@ -195,7 +195,9 @@ def _read_transforms(root: Path, model: Path | None) -> tuple[list[SourceView], 
     for note in notes:
         if not note.startswith("fields without effect"):
             warn(f"{content.files[0]}: {note}")
-    about = About(" and ".join(path.name for path in content.files), content.split, tuple(notes))
+    about = About(
+        " and ".join(path.name for path in content.files), " and ".join(content.split), tuple(notes)
+    )
     return content.frames, transforms_points(root, content, model), about
 
 

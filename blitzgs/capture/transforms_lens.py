@@ -110,7 +110,7 @@ def _focal_length(fields: Fields, axis: str, size: int, notes: dict[str, None]) 
     by_angle = None
     if angle in fields:
         radians = number(fields, angle)
-        if not 0 < radians < math.pi:
+        if not 0 < 0.5 * radians < 0.5 * math.pi:
             hint = f": as degrees it would be {math.radians(radians):.6g}" if radians > 0 else ""
             raise ValueError(
                 f"{angle} must be an angle of view in radians, above 0 and below pi, got {radians:g}{hint}"
@@ -118,7 +118,7 @@ def _focal_length(fields: Fields, axis: str, size: int, notes: dict[str, None]) 
         by_angle = 0.5 * size / math.tan(0.5 * radians)
     elif degrees in fields:  # instant-ngp's
         value = number(fields, degrees)
-        if not 0 < value < 180:
+        if not 0 < 0.5 * math.radians(value) < 0.5 * math.pi:
             raise ValueError(f"{degrees} must be an angle of view in degrees, above 0 and below 180")
         by_angle = 0.5 * size / math.tan(0.5 * math.radians(value))
     if length not in fields:

@@ -116,12 +116,12 @@ def test_blender_transforms(tmp_path):
         ({"w": math.inf, "h": 48}, "frame 0: w must be a finite number, got inf"),
         ({"w": 0, "h": 0}, "frame 0: the image's size must be at least 1 x 1 in whole pixels, got w = 0"),
         ({"fl_x": 10**400}, "frame 0: fl_x must be a finite number, got 10000"),
-        ({"file_path": ""}, "frame 0: file_path must name an image, got ''"),
-        ({"file_path": None}, "frame 0: file_path must name an image, got None"),
+        ({"file_path": ""}, "frame 0: file_path must name a file, got ''"),
+        ({"file_path": None}, "frame 0: file_path must name a file, got None"),
         ({"ply_file_path": None}, "ply_file_path must name a file, got None"),
         ({"ply_file_path": ""}, "ply_file_path must name a file, got ''"),
-        ({"mask_path": 3}, "frame 0: mask_path must name an image or be null, got 3"),
-        ({"mask_path": ""}, "frame 0: mask_path must name an image or be null, got ''"),
+        ({"mask_path": 3}, "frame 0: mask_path must name a file, got 3"),
+        ({"mask_path": ""}, "frame 0: mask_path must name a file, got ''"),
         ({"is_fisheye": True, "camera_model": "OPENCV"}, "frame 0: is_fisheye is true but camera_model is"),
         ({"k1": 1e300}, "the camera of .*a.png: the lens does not see along its own axis"),
     ],
@@ -229,7 +229,7 @@ def test_errors_name_the_file(tmp_path):
         ('{"frames": []}', "has no cameras"),
         (
             '{"w": 4, "h": 4, "fl_x": 3, "frames": [{"file_path": "a"}]}',
-            "frame 0: the field 'transform_matrix'",
+            "frame 0: the field transform_matrix",
         ),
     ):
         file.write_text(text)
