@@ -140,13 +140,13 @@ def _seen(
         return seen
     distances = np.where(seen, u[None, :] ** 2 + v[:, None] ** 2, np.inf)
     row, column = np.unravel_index(distances.argmin(), seen.shape)
-    if _is_folded(lens, float(u[column]), float(v[row])):
+    if is_folded(lens, float(u[column]), float(v[row])):
         raise ValueError(_UNSEEN.format(lens))
     _, labels = cv2.connectedComponents(seen.astype(np.uint8), connectivity=4)
     return np.asarray(labels == labels[row, column])
 
 
-def _is_folded(lens: Lens, u: float, v: float) -> bool:
+def is_folded(lens: Lens, u: float, v: float) -> bool:
     """Tell whether the lens mirrors the image or sees nothing somewhere between its axis and a direction."""
     share, step = np.linspace(0, 1, _GRID), 1e-5
     right, left = (lens.project(share * u + d, share * v) for d in (step, -step))

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from blitzgs.capture.cameras import Camera, Float64, camera_centres
+from blitzgs.capture.cameras import Camera, Float64, camera_centres, is_folded
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.names import any_case, by_parts
 from blitzgs.capture.world import WorldFrame, fit_similarity, read_small, utm_of_text
@@ -149,16 +149,9 @@ def normalised(lens: Lens, x: float, y: float) -> Float64:
         if not np.isfinite(jacobian).all() or abs(np.linalg.det(jacobian)) < 1e-9:
             break
         at = at - np.linalg.solve(jacobian, error)
-    if np.abs(error).max() < 1e-6 and _before_fold(lens, at):
+    if np.abs(error).max() < 1e-6 and not is_folded(lens, *at.tolist()):
         return at
     raise ValueError(f"the mark {x:g}, {y:g} is outside what its lens of {lens.width} x {lens.height} maps")
-
-
-def _before_fold(lens: Lens, at: Float64) -> bool:
-    """Tell whether the pixels move outwards all the way from the axis to a direction."""
-    shares = np.linspace(0, 1, 64)
-    path = np.stack(lens.project(shares * at[0], shares * at[1]), axis=1)
-    return bool((np.diff(path @ (at * lens.intrinsics[:2])) >= 0).all())
 
 
 def _intersect(cameras: Sequence[Camera], rays: Float64) -> Float64:

@@ -16,10 +16,10 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections import OrderedDict
 from collections.abc import Hashable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -50,7 +50,7 @@ from blitzgs.util.errors import located
 from blitzgs.util.terminal import amount
 
 DEFAULT_BUDGET = 4 << 30
-_MAPS_KEPT = 4
+_MAPS_KEPT = 4  # because those of a 12-megapixel image take 100 MB
 # "image" or "mask", the camera, and the factor by which it is reduced.
 _Key: TypeAlias = tuple[str, int, int]
 # Columns and rows of `Rectification.maps`, and which pixels the lens has seen.
@@ -129,7 +129,7 @@ class ImageStore:
         self.compressed: BoundedCache[Path | int, Any] = BoundedCache(budget_bytes)
         self._decoded_bytes = decoded_bytes
         self.decoded: BoundedCache[_Key, UInt8] = BoundedCache(self._decoded_budget())
-        self._maps: OrderedDict[Rectification, _Maps] = OrderedDict()
+        self._maps = lru_cache(_MAPS_KEPT)(_maps)
         self._maps_lock = threading.Lock()
         self._pending: dict[_Key, Future[UInt8]] = {}
         self._pending_lock = threading.Lock()
@@ -356,15 +356,13 @@ class ImageStore:
         return pixels
 
     def _maps_of(self, plan: Rectification) -> _Maps:
-        """Return a camera's maps. Only a few are kept, because those of a 12-megapixel image take 100 MB."""
-        with self._maps_lock:
-            if plan not in self._maps:
-                columns, rows, seen = plan.maps()
-                self._maps[plan] = columns, rows, seen.astype(np.uint8)
-                if len(self._maps) > _MAPS_KEPT:
-                    self._maps.popitem(last=False)
-            self._maps.move_to_end(plan)
-            return self._maps[plan]
+        with self._maps_lock:  # so that two threads do not make the same ones, which takes seconds
+            return self._maps(plan)
+
+
+def _maps(plan: Rectification) -> _Maps:
+    columns, rows, seen = plan.maps()
+    return columns, rows, seen.astype(np.uint8)
 
 
 def _uint8(pixels: npt.ArrayLike) -> UInt8:

@@ -195,14 +195,9 @@ def geodetic(position: Float64) -> tuple[float, float, float]:
     return math.degrees(latitude), math.degrees(math.atan2(y, x)), height
 
 
-def pyproj_module() -> Any:
-    """Return the package pyproj, which knows the reference systems (ImportError: it is not installed)."""
-    return optional_package("pyproj", "geo", "this")
-
-
 def reference_system(crs: str) -> Any:
     """Return a reference system by its name (ImportError: pyproj is missing; ValueError: it is unknown)."""
-    pyproj = pyproj_module()
+    pyproj = optional_package("pyproj", "geo", "this")
     try:
         return pyproj.CRS.from_user_input(crs)
     except pyproj.exceptions.CRSError as error:
@@ -215,7 +210,7 @@ def converted(positions: Float64, source: Any, target: Any) -> Float64:
     ImportError: pyproj is not installed. ValueError: a system is unknown, or a position has no coordinates in
     it.
     """
-    pyproj = pyproj_module()
+    pyproj = optional_package("pyproj", "geo", "this")
     try:
         transformer = pyproj.Transformer.from_crs(source, target, always_xy=True)
         moved = np.stack(transformer.transform(*positions.T, errcheck=True), axis=1)
