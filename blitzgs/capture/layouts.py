@@ -18,7 +18,7 @@ from blitzgs.capture.cameras import SourceView
 from blitzgs.capture.lengths import StrayCamera
 from blitzgs.capture.lens import lenses_of
 from blitzgs.capture.names import IMAGE_SUFFIXES, find_images, relative_to, to_convert
-from blitzgs.capture.points import SourcePoints, file_points, transforms_points
+from blitzgs.capture.points import SourcePoints, model_points, transforms_points
 from blitzgs.capture.projects.find import FoundProject, find_project, read_project
 from blitzgs.capture.world import WorldFrame, frame_beside
 from blitzgs.util.errors import located, warn
@@ -223,6 +223,4 @@ def _read_colmap(
         SourceView(f"{part}/{name}" if part else name, path, None, lens, pose)
         for name, path, lens, pose in zip(names, paths, lens_of, poses, strict=True)
     ]
-    if model.points_path is not None and model.points_path.suffix in colmap.POINT_SUFFIXES:
-        return views, file_points(model.points_path)
-    return views, SourcePoints.of_model(model.points, model.points_path, "the model's own colours")
+    return views, model_points(model)

@@ -120,10 +120,14 @@ class SourcePoints:
         """Return no points."""
         return cls.grey(np.zeros((0, 3)))
 
-    @classmethod
-    def of_model(cls, points: colmap.ColmapPoints, path: Path | None, colors_from: str) -> SourcePoints:
-        """Return the points of a COLMAP model."""
-        return cls(points.positions, points.colors, points.track_lengths, points.errors, path, colors_from)
+
+def model_points(model: colmap.ColmapModel) -> SourcePoints:
+    """Return the points of a COLMAP model, which may be in a file of another program."""
+    path, points = model.points_path, model.points
+    if path is not None and path.suffix in colmap.POINT_SUFFIXES:
+        return file_points(path)
+    columns = (points.positions, points.colors, points.track_lengths, points.errors)
+    return SourcePoints(*columns, path, "the model's own colours")
 
 
 def file_points(path: Path) -> SourcePoints:
@@ -182,10 +186,7 @@ def _model_points(root: Path, content: Transforms, folder: Path) -> SourcePoints
             f"{folder.relative_to(root)} are not used: {reason}; name a PLY with ply_file_path"
         )
         return None
-    if model.points_path is not None and model.points_path.suffix in colmap.POINT_SUFFIXES:
-        points = file_points(model.points_path)
-    else:
-        points = SourcePoints.of_model(model.points, folder, "the model")
+    points = model_points(model)
     points.positions = content.moved(points.positions)
     return points
 

@@ -89,7 +89,9 @@ def examine(
         SourceView(name, photographs.folder / name, None, lenses[camera], pose)
         for name, camera, pose in zip(names, model.images.camera_ids.tolist(), poses, strict=True)
     ]
-    errors, points = _errors(model)
+    seen = {name: missed[~np.isnan(missed)] for name, missed in distances(model).items()}
+    points = {name: len(missed) for name, missed in seen.items()}
+    errors = {name: float(missed.mean()) if len(missed) else 0.0 for name, missed in seen.items()}
     doubtful = {
         s.name: f"lies at {s.distance:.6g} from the middle, the others within {s.others:.6g}"
         for s in find_apart(views, model.points.positions)[1]
@@ -147,17 +149,11 @@ def misses(model: ColmapModel) -> Float64:
     return found
 
 
-def _errors(model: ColmapModel) -> tuple[dict[str, float], dict[str, int]]:
-    """Return the mean of each photograph's misses, in pixels, and their number."""
-    errors, counts = {}, {}
-    distances = np.linalg.norm(misses(model), axis=1)
-    for name, missed in zip(
-        model.images.names, np.split(distances, model.images.point2d_offsets[1:-1].tolist()), strict=True
-    ):
-        seen = missed[~np.isnan(missed)]
-        counts[name] = len(seen)
-        errors[name] = float(seen.mean()) if len(seen) else 0.0
-    return errors, counts
+def distances(model: ColmapModel) -> dict[str, Float64]:
+    """Return the lengths of each photograph's misses, by its name."""
+    lengths = np.linalg.norm(misses(model), axis=1)
+    parts = np.split(lengths, model.images.point2d_offsets[1:-1].tolist())
+    return dict(zip(model.images.names, parts, strict=True))
 
 
 def _reason(found: Found, part: int) -> str:

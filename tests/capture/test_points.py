@@ -134,7 +134,7 @@ def test_the_points_of_colmap_beside_transforms_are_used_in_their_world(tmp_path
     expected = (model.points.positions @ matrix[:, :3].T + matrix[:, 3]) * fields.get("applied_scale", 1.0)
     np.testing.assert_allclose(capture.points + capture.offset, expected, atol=1e-9)
     np.testing.assert_array_equal(capture.colors, model.points.colors)
-    assert capture.about.points_from == "colmap/sparse/0" and capture.about.blind == 0
+    assert capture.about.points_from == "colmap/sparse/0/points3D.bin" and capture.about.blind == 0
 
 
 def test_points_of_another_world_are_named_and_not_used(tmp_path):

@@ -284,12 +284,12 @@ def test_a_failing_stage_shows_colmaps_last_words(tmp_path, monkeypatch):
     log = tmp_path / "log.txt"
     with log.open("w") as lock, pytest.raises(engine.StageError, match="status 3: it is dark") as error:
         engine._run(
-            ["sh", "-c", "echo start; echo it is dark; exit 3"], log, lock.fileno(), lambda line: None
+            ["sh", "-c", "echo start; echo it is dark; exit 3"], log, lock.fileno(), lambda done, total: None
         )
     assert str(log) in str(error.value) and log.read_text() == "start\nit is dark\n"
     monkeypatch.setattr(engine, "_LEAST_SPACE", math.inf)
     with log.open("w") as lock, pytest.raises(engine.StageError, match="the disk is nearly full"):
-        engine._run(["false"], log, lock.fileno(), lambda line: None)
+        engine._run(["false"], log, lock.fileno(), lambda done, total: None)
 
 
 ROOT = Path(__file__).resolve().parents[2]
