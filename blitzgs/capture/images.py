@@ -16,12 +16,13 @@ from __future__ import annotations
 
 import contextlib
 import threading
+from collections import OrderedDict
 from collections.abc import Hashable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Generic, TypeAlias, TypeVar
 
 import cv2
 import numpy as np
@@ -43,12 +44,13 @@ from blitzgs.capture.image_files import (
     reduced_mask,
 )
 from blitzgs.capture.masks import FileCheck, misfit
-from blitzgs.capture.shared_images import BoundedCache as BoundedCache
 from blitzgs.capture.shared_images import SharedImages
 from blitzgs.formats import native
 from blitzgs.util.errors import located
 from blitzgs.util.terminal import amount
 
+K = TypeVar("K")
+V = TypeVar("V")
 DEFAULT_BUDGET = 4 << 30
 _MAPS_KEPT = 4  # because those of a 12-megapixel image take 100 MB
 # "image" or "mask", the camera, and the factor by which it is reduced.
@@ -76,6 +78,50 @@ class ImageMemory:
             f"{amount(self.compressed_budget)}), {amount(self.decoded_bytes)} decoded (limit "
             f"{amount(self.decoded_budget)}); {self.decoded:,} decodings"
         )
+
+
+class BoundedCache(Generic[K, V]):
+    """A least-recently-used cache with a budget of bytes; an entry larger than the budget is not stored."""
+
+    def __init__(self, budget: int) -> None:
+        """Hold at most `budget` bytes."""
+        self.budget = budget  # the largest size, in bytes
+        self.bytes = 0  # the size now
+        self.most_bytes = 0  # the largest size so far
+        self._entries: OrderedDict[K, tuple[V, int]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: K) -> V | None:
+        """Return the entry and mark it as the most recently used; None if it is not stored."""
+        with self._lock:
+            if key not in self._entries:
+                return None
+            self._entries.move_to_end(key)
+            return self._entries[key][0]
+
+    def put(self, key: K, value: V, size: int, spare: bool = False) -> None:
+        """Add or replace an entry of `size` bytes, dropping the oldest until all fit.
+
+        A spare entry drops no other one, and is the first to be dropped.
+        """
+        with self._lock:
+            if key in self._entries:
+                self.bytes -= self._entries.pop(key)[1]
+            if size > self.budget or (spare and self.bytes + size > self.budget):
+                return
+            while self.bytes + size > self.budget:
+                self.bytes -= self._entries.popitem(last=False)[1][1]
+            self._entries[key] = (value, size)
+            self._entries.move_to_end(key, last=not spare)
+            self.bytes += size
+            self.most_bytes = max(self.most_bytes, self.bytes)
+
+    def resize(self, budget: int) -> None:
+        """Change the budget, dropping the oldest entries until the others fit."""
+        with self._lock:
+            self.budget = budget
+            while self.bytes > budget:
+                self.bytes -= self._entries.popitem(last=False)[1][1]
 
 
 class PhotographError(RuntimeError):

@@ -44,18 +44,16 @@ def with_finite_poses(views: list[SourceView]) -> list[SourceView]:
 
 def check_lenses(views: list[SourceView]) -> None:
     """Refuse lenses that no camera has, and name those that are unusual."""
-    unusual: dict[Lens, str] = {}
-    checked: set[Lens] = set()
+    first: dict[Lens, str] = {}
     for view in views:
-        if view.lens in checked:
-            continue
-        checked.add(view.lens)
-        with located(f"the camera of {view.name}"):
-            doubt = check_lens(view.lens)
-        if doubt:
-            unusual[view.lens] = f"{view.name}: {doubt}"
+        first.setdefault(view.lens, view.name)
+    unusual = []
+    for lens, name in first.items():
+        with located(f"the camera of {name}"):
+            if doubt := check_lens(lens):
+                unusual.append(f"{name}: {doubt}")
     if unusual:
-        warn(f"{len(unusual)} of {len(checked)} cameras are unusual (first: {next(iter(unusual.values()))})")
+        warn(f"{len(unusual)} of {len(first)} cameras are unusual (first: {unusual[0]})")
 
 
 def without_strays(

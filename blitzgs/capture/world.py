@@ -75,14 +75,8 @@ class WorldFrame:
 
     def as_json(self) -> dict[str, Any]:
         """Return the content of the file `geo.json`."""
-        return {
-            "meaning": "world = scale * rotation @ capture + translation",
-            "crs": self.crs,
-            "scale": float(self.scale),
-            "rotation": np.asarray(self.rotation).tolist(),
-            "translation": np.asarray(self.translation).tolist(),
-            "source": self.source,
-        }
+        arrays = {name: np.asarray(getattr(self, name)).tolist() for name in ("rotation", "translation")}
+        return {"meaning": "world = scale * rotation @ capture + translation", **vars(self), **arrays}
 
 
 def fit_similarity(capture: Float64, world: Float64, crs: str = "", source: str = "") -> WorldFrame:

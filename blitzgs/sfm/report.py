@@ -14,13 +14,13 @@ import numpy.typing as npt
 
 from blitzgs.capture.cameras import SourceView, camera_centres
 from blitzgs.capture.colmap import ColmapModel, Float64, count_images, read_model, world_to_camera
+from blitzgs.capture.image_files import UInt8
 from blitzgs.capture.lengths import find_apart
 from blitzgs.capture.lens import lenses_of
 from blitzgs.sfm.engine import Found, Job, read_found, read_positions
 from blitzgs.sfm.photographs import Photographs
 from blitzgs.util.output import write_file
 
-UInt8 = npt.NDArray[np.uint8]
 # A photograph with fewer points is held weakly. One whose error is so many times the median is doubtful.
 _FEW_POINTS, _FEW_FEATURES, _DOUBTFUL = 50, 100, 3.0
 # A warning is given if a smaller share has a pose, or the mean error is larger, in pixels.
