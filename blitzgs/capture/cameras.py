@@ -10,6 +10,7 @@ axis) and marks the rest.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +79,7 @@ class Rectification:
         return (np.asarray(columns) + 0.5 + self.x0 - cx) / fx, (np.asarray(rows) + 0.5 + self.y0 - cy) / fy
 
 
+@cache
 def rectify(lens: Lens, policy: str = "crop") -> Rectification:
     """Choose the pinhole image for a lens; `policy` is "crop" or "mask".
 

@@ -19,7 +19,6 @@ from blitzgs.capture.cameras import (
     MAX_SIDE,
     Camera,
     Float64,
-    Rectification,
     SourceView,
     camera_centres,
     downscaled_size,
@@ -30,7 +29,6 @@ from blitzgs.capture.cameras import (
 from blitzgs.capture.image_files import ImageHeader, in_threads, read_header
 from blitzgs.capture.layouts import About, read_layout
 from blitzgs.capture.lengths import blind_views, find_apart, measured_extent, near_plane, nearest_depths
-from blitzgs.capture.lens import Lens
 from blitzgs.capture.masks import FindDamage, check_mask_sizes, check_masks, damaged, find_masks
 from blitzgs.capture.names import MissingImagesError as MissingImagesError
 from blitzgs.capture.names import check_inside, existing, relative_to, to_convert
@@ -161,9 +159,8 @@ def load_capture(
     if not train:
         raise MissingImagesError(f"{root}: no image of a training view is on disk and whole")
     headers = _headers(views)
-    plans: dict[Lens, Rectification] = {}
     cameras = [
-        _camera(view, header, offset, downscale, undistort, exif, plans)
+        _camera(view, header, offset, downscale, undistort, exif)
         for view, header in zip(views, headers, strict=True)
     ]
     check_mask_sizes(cameras)
@@ -266,7 +263,6 @@ def _camera(
     downscale: float,
     policy: str,
     exif: str,
-    plans: dict[Lens, Rectification],
 ) -> Camera:
     orientation = _orientation(view, header, exif)
     width, height = (header.height, header.width) if orientation >= 5 else (header.width, header.height)
@@ -281,11 +277,8 @@ def _camera(
             f"{view.path} is {width} x {height}: no side may be longer than {MAX_SIDE:,} pixels; put a "
             "smaller copy in its place"
         )
-    lens = view.lens.scaled(width, height)
-    if lens not in plans:
-        with located(f"the camera of {view.path}"):
-            plans[lens] = rectify(lens, policy)
-    plan = plans[lens]
+    with located(f"the camera of {view.path}"):
+        plan = rectify(view.lens.scaled(width, height), policy)
     # Images from images_N are downscaled already; only the rest of the factor is applied while decoding.
     already = max(1.0, view.lens.width / width) if downscale > 1 else 1.0
     left = downscale / already if downscale / already > 1.01 else 1.0
