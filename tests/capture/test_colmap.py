@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Models of COLMAP, and the names of image files in all layouts."""
 
-import json
 import os
+import shutil
 import unicodedata
 
 import numpy as np
@@ -14,12 +14,16 @@ from blitzgs.capture.names import files_below, match_names
 from blitzgs.formats import native
 from tests.capture.helpers import (
     as_text,
+    at,
     edit_model,
+    frame,
     reconstruction,
     shared_data,
     smooth_image,
     write_capture,
     write_image,
+    write_ply,
+    write_transforms,
 )
 from tests.helpers import refused
 
@@ -260,16 +264,10 @@ def test_transforms_that_were_written_on_windows(tmp_path):
     for i in range(3):
         write_image(tmp_path / "images" / f"{i}.png", smooth_image(48, 64, i))
         write_image(tmp_path / "masks" / f"{i}.png", np.full((48, 64, 3), 255, dtype=np.uint8))
-        pose = np.eye(4)
-        pose[0, 3] = i
-        frame = {"file_path": f".\\images\\{i}.png", "mask_path": f"masks\\{i}.png"}
-        frames.append(frame | {"transform_matrix": pose.tolist()})
-    (tmp_path / "cloud").mkdir()
-    header = "ply\nformat ascii 1.0\nelement vertex 1\n" + "".join(f"property float {a}\n" for a in "xyz")
-    (tmp_path / "cloud" / "p.ply").write_text(header + "end_header\n0.5 0 -3\n")
-    content = {"w": 64, "h": 48, "fl_x": 60.0, "ply_file_path": "cloud\\p.ply", "frames": frames}
-    content["test_filenames"] = [".\\images\\1.png"]
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
+        frames.append(frame(f".\\images\\{i}.png", at(i, 0, 0), mask_path=f"masks\\{i}.png"))
+    write_ply(tmp_path / "cloud" / "p.ply", [[0.5, 0, -3]])
+    named = {"ply_file_path": "cloud\\p.ply", "test_filenames": [".\\images\\1.png"]}
+    write_transforms(tmp_path, frames, w=64, h=48, fl_x=60.0, **named)
     capture = load_capture(tmp_path)
     assert [camera.name for camera in capture.cameras] == [f"images/{i}.png" for i in range(3)]
     assert [camera.mask_path for camera in capture.cameras] == [
@@ -328,17 +326,10 @@ def test_names_that_lead_outside_the_capture(tmp_path, way):
         (root / "images" / "a.png").unlink()
         (root / "images" / "a.png").symlink_to(outside)
     elif way == "mask":
-        frame = {
-            "transform_matrix": np.eye(4).tolist(),
-            "file_path": "images/a.png",
-            "mask_path": "../secret.png",
-        }
-        other = {"file_path": "images/b.png", "transform_matrix": np.diag([-1.0, 1, -1, 1]).tolist()}
-        other["transform_matrix"][2][3] = -9.0
-        content = {"w": 64, "h": 48, "fl_x": 60.0, "frames": [frame, other]}
-        (root / "transforms.json").write_text(json.dumps(content))
-        for path in (root / "sparse" / "0").iterdir():
-            path.unlink()
+        facing = at(0, 0, -9) @ np.diag([-1.0, 1, -1, 1])
+        frames = [frame("images/a.png", mask_path="../secret.png"), frame("images/b.png", facing)]
+        write_transforms(root, frames, w=64, h=48, fl_x=60.0)
+        shutil.rmtree(root / "sparse")
     else:
 
         def rename(model):

@@ -2,7 +2,6 @@
 """Splits by rule and by a capture's own files, and photographs that have no camera."""
 
 import itertools
-import json
 import warnings
 from pathlib import Path
 
@@ -12,7 +11,14 @@ import pytest
 from blitzgs.capture.cameras import SourceView
 from blitzgs.capture.capture import load_capture
 from blitzgs.capture.splits import split_views
-from tests.capture.helpers import reconstruction, smooth_image, write_capture, write_image
+from tests.capture.helpers import (
+    frame,
+    reconstruction,
+    smooth_image,
+    write_capture,
+    write_image,
+    write_transforms,
+)
 from tests.helpers import look_at_origin, refused
 
 NAMES = ["a/1.jpg", "a/2.jpg", "b/1.jpg", "b/3.jpg"]
@@ -88,13 +94,10 @@ FRAMES = [f"images/f{i}.png" for i in range(6)]
 
 
 def frames(names=FRAMES):
-    found = []
-    for i, name in enumerate(names):
-        angle, pose = 2 * np.pi * i / 6, np.eye(4)
-        centre = np.array([4 * np.cos(angle), 4 * np.sin(angle), 0.5])
-        pose[:3, :3], pose[:3, 3] = look_at_origin(centre)[:3, :3].T @ np.diag([1.0, -1, -1]), centre
-        found.append({"file_path": name, "transform_matrix": pose.tolist()})
-    return found
+    angles = 2 * np.pi * np.arange(len(names)) / 6
+    places = np.stack([4 * np.cos(angles), 4 * np.sin(angles), np.full(len(names), 0.5)], axis=1)
+    poses = [np.linalg.inv(look_at_origin(place)) @ np.diag([1.0, -1, -1, 1]) for place in places]
+    return [frame(name, pose) for name, pose in zip(names, poses, strict=True)]
 
 
 def write_images(root):
@@ -103,7 +106,7 @@ def write_images(root):
 
 
 def write(root, file="transforms.json", names=FRAMES, **fields):
-    (root / file).write_text(json.dumps({"fl_x": 40.0, "frames": frames(names), **fields}))
+    write_transforms(root, frames(names), file, fl_x=40.0, **fields)
 
 
 def split_of(root, **options):
