@@ -23,6 +23,7 @@ from tests.capture.helpers import smooth_image, tiff, write_capture, write_image
 from tests.helpers import refused
 
 NAMES = [f"{i}.png" for i in range(9)]
+DIAGONAL = np.repeat(255 * np.eye(48, 64, dtype=np.uint8)[..., None], 3, axis=2)  # of a mask
 BOX = b"\0\0\0\x20ftyp%s\0\0\0\0mif1" + bytes(20)
 
 
@@ -142,9 +143,7 @@ def spoil(path):
 def test_damage_is_found_in_the_background_and_ends_every_read(tmp_path, kind, index):
     root = write_capture(tmp_path, NAMES)
     for name in NAMES:
-        write_image(
-            root / "masks" / name, np.eye(48, 64, dtype=np.uint8)[..., None] * np.full(3, 255, np.uint8)
-        )
+        write_image(root / "masks" / name, DIAGONAL)
     capture = load_capture(root)
     store = ImageStore(capture)
     store.check_files(range(9)).wait()
@@ -170,9 +169,7 @@ def test_photographs_without_a_pixel_that_counts_are_named(tmp_path, kind):
     if kind == "transparent":
         cv2.imwrite(str(root / "images" / NAMES[2]), np.zeros((48, 64, 4), dtype=np.uint8))
     else:
-        write_image(
-            root / "masks" / NAMES[1], np.eye(48, 64, dtype=np.uint8)[..., None] * np.full(3, 255, np.uint8)
-        )
+        write_image(root / "masks" / NAMES[1], DIAGONAL)
         write_image(root / "masks" / NAMES[2], np.zeros((48, 64, 3), dtype=np.uint8))
     store = ImageStore(load_capture(root))
     with pytest.warns(UserWarning, match="1 photographs have no pixel that counts.*first: 2.png"):
