@@ -50,10 +50,7 @@ def find_masks(
         return list(given)
     files = [name for name in files_below(folder) if PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES]
     owners = _owners(folder, files, [None if path else name for name, path in zip(names, given, strict=True)])
-    found = [
-        path if path is not None or index not in owners else folder / owners[index]
-        for index, path in enumerate(given)
-    ]
+    found = [path or (folder / owners[i] if i in owners else None) for i, path in enumerate(given)]
     used = {path for path in found if path is not None}
     unused = [name for name in files if folder / name not in used]
     if files and not used:

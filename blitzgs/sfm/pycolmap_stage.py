@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from blitzgs.sfm.engine import MANY, adopt, least_model, lens_model
+from blitzgs.sfm.engine import MANY, adopt, camera_of, least_model, lens_model
 
 # The standard deviations of a position by GPS in metres, across and up; the second of an altitude that says
 # nothing. Drones state altitudes by barometer, which drift between flights.
@@ -54,10 +54,8 @@ def features(job: dict[str, Any]) -> None:
         options.camera_model = lens_model(job["camera_model"], len(names))
         if job["masks"]:
             options.mask_path = job["masks"]
-        with pycolmap.Database.open(job["database"]) as database:
-            before = (database.read_image_with_name(name) for name in names)
-            if (image := next(filter(None, before), None)) is not None:  # of an interrupted stage
-                options.existing_camera_id = image.camera_id
+        if (camera_id := camera_of(Path(job["database"]), names)) is not None:
+            options.existing_camera_id = camera_id
         pycolmap.extract_features(
             job["database"], photos, names, pycolmap.CameraMode.SINGLE, reader_options=options
         )

@@ -40,7 +40,7 @@ def test_every_nth_view_is_held_out(spec, test):
 
 def test_list_file_matches_names_file_names_and_stems(tmp_path):
     # A byte order mark, as of editors on Windows, is no part of the first line.
-    (tmp_path / "test.txt").write_bytes(b"\xef\xbb\xbfa\\1.jpg\r\n# held out\n\n2.jpg  # by file name\n3\n")
+    (tmp_path / "test.txt").write_bytes(b"\xef\xbb\xbfa\\1.jpg\r\n# held out\n\n2.JPG  # by file name\n3\n")
     assert split(tmp_path, "test.txt") == ([2], [0, 1, 3])
     assert split(ROOT, tmp_path / "test.txt") == ([2], [0, 1, 3])
 
