@@ -17,14 +17,14 @@ from blitzgs.capture import colmap, transforms
 from blitzgs.capture.cameras import SourceView
 from blitzgs.capture.lengths import StrayCamera
 from blitzgs.capture.lens import lenses_of
-from blitzgs.capture.names import IMAGE_SUFFIXES, find_images, relative_to, to_convert
+from blitzgs.capture.names import BY_PRODUCTS, IMAGE_SUFFIXES, find_images, relative_to, to_convert
 from blitzgs.capture.points import SourcePoints, model_points, transforms_points
 from blitzgs.capture.projects.find import FoundProject, find_project, read_project
 from blitzgs.capture.world import WorldFrame, frame_beside
 from blitzgs.util.errors import located, warn
 
 # What programs write beside the images of a synthetic capture.
-_BY_PRODUCT = re.compile(r"(?i)(depth|normal|disp|mask|alpha|segmentation)s?(_?\d+)?$")
+_BY_PRODUCT = re.compile(rf"(?i)({BY_PRODUCTS})s?(_?\d+)?$")
 
 
 @dataclass(frozen=True)

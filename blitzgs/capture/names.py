@@ -24,8 +24,9 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".a
 # Of photographs that have to be converted; the cameras may have been found before that.
 _CONVERTED_SUFFIXES = (".heic", ".heif", ".dng", ".arw", ".cr2", ".cr3", ".nef", ".orf", ".rw2", ".jxl")
 _VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mts", ".insv", ".360")
-# Folders of what belongs to photographs and has their names, but shows something else.
-_BY_PRODUCT = re.compile(r"(?i)(^|/)(depth|normal|disp|mask|alpha|segmentation|semantic)[^/]*/")
+# How folders and files are called that belong to photographs and have their names, but show something else.
+BY_PRODUCTS = "depth|normal|disp|mask|alpha|segmentation|semantic"
+_BY_PRODUCT = re.compile(rf"(?i)(^|/)({BY_PRODUCTS})[^/]*/")
 # Of folders in each other.
 _DEEPEST = 8
 

@@ -15,7 +15,7 @@ import numpy as np
 from blitzgs.capture.colmap import Float64, find_incomplete_model
 from blitzgs.capture.image_files import decode_mask, in_threads, read_header, read_whole
 from blitzgs.capture.masks import damaged, find_masks
-from blitzgs.capture.names import IMAGE_SUFFIXES, files_below, to_convert
+from blitzgs.capture.names import BY_PRODUCTS, IMAGE_SUFFIXES, files_below, to_convert
 from blitzgs.capture.projects.find import find_project
 from blitzgs.capture.transforms import find_transforms
 from blitzgs.sfm.engine import MOST_IN_ALL_PAIRS
@@ -23,9 +23,7 @@ from blitzgs.util.errors import warn
 from blitzgs.util.output import write_file
 
 # Files and folders of what programs write beside photographs.
-_BY_PRODUCT = re.compile(
-    r"(?i)(^|/)(depth|normal|disp|mask|alpha|segmentation|semantic)s?(_?\d+)?[./]|_mask\.|\.mask\."
-)
+_BY_PRODUCT = re.compile(rf"(?i)(^|/)({BY_PRODUCTS})s?(_?\d+)?[./]|_mask\.|\.mask\.")
 # A place by GPS is right to some metres: photographs within fewer metres say nothing of each other.
 _LEAST_SPREAD = 30.0
 _METRES_PER_DEGREE = 111_000.0

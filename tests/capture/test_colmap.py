@@ -58,10 +58,8 @@ def assert_same(model: colmap.ColmapModel, rec: pycolmap.Reconstruction) -> None
         assert points.track_lengths[i] == other.track.length()
         rows = slice(*points.track_offsets[i : i + 2].tolist())
         track = [(e.image_id, e.point2D_idx) for e in other.track.elements]
-        found = list(
-            zip(points.track_image_ids[rows].tolist(), points.track_point2d_ids[rows].tolist(), strict=True)
-        )
-        assert found == track
+        found = (points.track_image_ids[rows].tolist(), points.track_point2d_ids[rows].tolist())
+        assert list(zip(*found, strict=True)) == track
 
 
 def test_every_camera_model_of_colmap_is_known_with_its_parameters():
@@ -77,9 +75,7 @@ def test_every_camera_model_of_colmap_is_known_with_its_parameters():
 @pytest.mark.parametrize("model", [m for m in pycolmap.CameraModelId.__members__ if m != "INVALID"])
 @pytest.mark.parametrize("text", [False, True])
 def test_reads_what_colmap_writes_and_colmap_reads_what_we_write(tmp_path, model, text):
-    names = (
-        [name.replace(" ", "_") for name in NAMES] if text else NAMES
-    )  # COLMAP's text reader ends at a blank
+    names = [name.replace(" ", "_") if text else name for name in NAMES]  # its text reader ends at a blank
     rec = reconstruction(names, 640, 480, model=model)
     (rec.write_text if text else rec.write_binary)(str(tmp_path))
     ours = colmap.read_model(tmp_path, points2d=True, tracks=True)
@@ -98,11 +94,8 @@ def test_observations_and_tracks_are_left_out_unless_asked_for(tmp_path):
     model = colmap.read_model(tmp_path)
     assert model.images.points2d.shape == (0, 2) and not model.images.point2d_offsets.any()
     assert len(model.points.track_image_ids) == 0
-    assert (
-        model.points.track_lengths.tolist()
-        == colmap.read_model(tmp_path, tracks=True).points.track_lengths.tolist()
-    )
-    assert model.points.track_lengths.sum() > 0
+    lengths = model.points.track_lengths.tolist()
+    assert lengths == colmap.read_model(tmp_path, tracks=True).points.track_lengths.tolist() and sum(lengths)
 
 
 def test_an_empty_model_round_trips(tmp_path):
@@ -270,9 +263,8 @@ def test_transforms_that_were_written_on_windows(tmp_path):
     write_transforms(tmp_path, frames, w=64, h=48, fl_x=60.0, **named)
     capture = load_capture(tmp_path)
     assert [camera.name for camera in capture.cameras] == [f"images/{i}.png" for i in range(3)]
-    assert [camera.mask_path for camera in capture.cameras] == [
-        tmp_path / "masks" / f"{i}.png" for i in range(3)
-    ]
+    masks = [camera.mask_path for camera in capture.cameras]
+    assert masks == [tmp_path / "masks" / f"{i}.png" for i in range(3)]
     assert capture.test == [1] and len(capture.points) == 1
 
 
@@ -285,17 +277,13 @@ def test_files_are_found_once_and_none_that_is_hidden(tmp_path):
     assert files_below(tmp_path) == ["a.jpg", "day/b.jpg", "night/b.jpg"]
 
 
-def fifo(path):
-    os.mkfifo(path)
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda path: path.symlink_to("lost.jpg"), "is a link to lost.jpg: No such file or directory"),
         (lambda path: path.symlink_to(path.name), "is a link to a.jpg: Too many levels of symbolic links"),
         (lambda path: path.mkdir(), "is a folder"),
-        (fifo, "is a named pipe"),
+        (os.mkfifo, "is a named pipe"),
         (lambda path: path.symlink_to("/dev/null"), "is a device"),
     ],
 )
