@@ -5,8 +5,10 @@ import json
 import os
 import struct
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,6 +28,12 @@ def shared_data() -> Path | None:
     """Folder of the real captures: BLITZGS_SHARED_DATA, or shared/data beside the repository."""
     candidates = [os.environ.get("BLITZGS_SHARED_DATA", ""), ROOT.parent / "shared" / "data"]
     return next((Path(p) for p in candidates if p and Path(p).is_dir()), None)
+
+
+def warned(text: str, call: Callable, /, *given: object, **named: object) -> Any:
+    """Check that a call warns with a text that the regular expression matches; return its result."""
+    with pytest.warns(UserWarning, match=text):
+        return call(*given, **named)
 
 
 def smooth_image(height: int, width: int, seed: int = 0) -> np.ndarray:

@@ -13,7 +13,7 @@ from blitzgs.capture.cameras import camera_centres
 from blitzgs.capture.capture import load_capture
 from blitzgs.capture.image_files import ImageHeader, apply_orientation, read_header
 from blitzgs.capture.images import ImageStore
-from tests.capture.helpers import edit_model, shared_data, smooth_image, write_capture, write_image
+from tests.capture.helpers import edit_model, shared_data, smooth_image, warned, write_capture, write_image
 from tests.helpers import refused
 
 pytestmark = [
@@ -85,8 +85,7 @@ def test_prescaled_folder_is_used_when_it_fits_and_not_otherwise(tmp_path):
         capture = load_capture(tmp_path, downscale=2)
     assert {c.image_path.parent.name for c in capture.cameras} == {"images"}
     (tmp_path / "images_2" / NAMES[1]).unlink()
-    with pytest.warns(UserWarning, match=f"lacks {NAMES[1]}"):
-        load_capture(tmp_path, downscale=2)
+    warned(f"lacks {NAMES[1]}", load_capture, tmp_path, downscale=2)
 
 
 def test_images_smaller_than_their_camera_scale_its_matrix(tmp_path):
@@ -246,8 +245,7 @@ def test_missing_images_are_named_or_dropped(tmp_path):
     write_capture(tmp_path, NAMES)
     (tmp_path / "images" / NAMES[3]).unlink()
     refused(FileNotFoundError, f"1 of 9 images are not in .*images: {NAMES[3]}", load_capture, tmp_path)
-    with pytest.warns(UserWarning, match="dropped"):
-        capture = load_capture(tmp_path, allow_missing=True)
+    capture = warned("dropped", load_capture, tmp_path, allow_missing=True)
     assert [c.name for c in capture.cameras] == NAMES[:3] + NAMES[4:]
 
 
@@ -282,8 +280,7 @@ def test_unseen_points_cause_a_warning(tmp_path, recwarn):
         model.points.positions += np.array([1e4, -1e4, 1e4])
 
     edit_model(tmp_path, move_away)
-    with pytest.warns(UserWarning, match=r"4 of 4 views \(first: 0.png\) see none of the points"):
-        load_capture(tmp_path)
+    warned(r"4 of 4 views \(first: 0.png\) see none of the points", load_capture, tmp_path)
 
 
 def test_a_model_without_points_starts_from_random_ones_where_the_cameras_look(tmp_path):
@@ -291,8 +288,7 @@ def test_a_model_without_points_starts_from_random_ones_where_the_cameras_look(t
     folder = tmp_path / "sparse" / "0"
     model = colmap.read_model(folder)
     colmap.write_model(folder, colmap.ColmapModel(model.cameras, model.images))
-    with pytest.warns(UserWarning, match="no points; 100,000 random ones take their place"):
-        capture = load_capture(tmp_path)
+    capture = warned("no points; 100,000 random ones take their place", load_capture, tmp_path)
     points = capture.points + capture.offset  # the cameras look at the origin from a distance of 4
     assert np.abs(points.mean(axis=0)).max() < 0.05 and 1.2 < np.abs(points).max() < 1.6
     with pytest.warns(UserWarning, match="random"):
@@ -302,8 +298,7 @@ def test_a_model_without_points_starts_from_random_ones_where_the_cameras_look(t
 
 def test_one_camera_gets_an_extent_from_the_points(tmp_path):
     write_capture(tmp_path, NAMES[:1])
-    with pytest.warns(UserWarning, match="all training cameras are in one place"):
-        capture = load_capture(tmp_path)
+    capture = warned("all training cameras are in one place", load_capture, tmp_path)
     assert capture.extent == pytest.approx(np.median(np.linalg.norm(capture.points, axis=1)))
     assert (capture.train, capture.test) == ([0], [])
 
@@ -317,8 +312,7 @@ def test_a_rotating_camera_is_in_one_place_whatever_rounding_says(tmp_path):
 
     folder = write_capture(tmp_path, NAMES)
     edit_model(folder, rotate_only)
-    with pytest.warns(UserWarning, match="all training cameras are in one place"):
-        capture = load_capture(folder)
+    capture = warned("all training cameras are in one place", load_capture, folder)
     distances = np.linalg.norm(capture.points, axis=1)
     assert 0.5 * np.median(distances) < capture.extent < 2 * np.median(distances)
 
@@ -350,5 +344,4 @@ def test_masks_that_belong_to_no_image_are_not_ignored(tmp_path, name):
     refused(ValueError, f"none of the 1 masks in .*{name}.*data.masks=false", load_capture, root)
     assert load_capture(root, masks=False).cameras[0].mask_path is None
     cv2.imwrite(str(root / "masks" / f"{NAMES[1]}.png"), mask)
-    with pytest.warns(UserWarning, match=f"1 of 2 masks in .* belong to no image .first: {name}"):
-        load_capture(root)
+    warned(f"1 of 2 masks in .* belong to no image .first: {name}", load_capture, root)

@@ -19,7 +19,7 @@ from blitzgs.capture.image_files import (
 )
 from blitzgs.capture.images import ImageStore
 from blitzgs.capture.masks import damaged
-from tests.capture.helpers import smooth_image, tiff, write_capture, write_image
+from tests.capture.helpers import edit_model, smooth_image, tiff, warned, write_capture, write_image
 from tests.helpers import refused
 
 NAMES = [f"{i}.png" for i in range(9)]
@@ -64,11 +64,8 @@ KINDS = [
 @pytest.mark.parametrize(("name", "data", "kind"), KINDS)
 def test_what_is_not_supported_is_called_so_at_load(tmp_path, name, data, kind, capfd):
     root = write_capture(tmp_path, ["a.png"])
-    (root / "images" / "a.png").unlink()
-    (root / "images" / name).write_bytes(data)
-    (root / "sparse" / "0" / "images.bin").write_bytes(
-        (root / "sparse" / "0" / "images.bin").read_bytes().replace(b"a.png", name.encode())
-    )
+    (root / "images" / "a.png").rename(root / "images" / name).write_bytes(data)
+    edit_model(root, lambda model: model.images.names.__setitem__(0, name))
     with pytest.raises(ValueError, match=rf"{name}: .*not supported: {kind}.*convert") as caught:
         load_capture(root)
     assert "damaged" not in str(caught.value)
@@ -155,10 +152,8 @@ def test_damage_is_found_in_the_background_and_ends_every_read(tmp_path, kind, i
     store.check_files(range(9)).wait()
     refused(ValueError, ("the mask: " if kind == "mask" else "") + rf".*{index}.png: at byte", store.get, 7)
     store.close()
-    with pytest.warns(
-        UserWarning, match=rf"1 of 9 images or their masks are damaged; dropped .*{index}.png: at"
-    ):
-        left = load_capture(root, allow_missing=True)
+    message = rf"1 of 9 images or their masks are damaged; dropped .*{index}.png: at"
+    left = warned(message, load_capture, root, allow_missing=True)
     assert len(left.cameras) == 8 and left.about.damaged == 1
     np.testing.assert_array_equal(left.offset, capture.offset)
 
@@ -172,8 +167,9 @@ def test_photographs_without_a_pixel_that_counts_are_named(tmp_path, kind):
         write_image(root / "masks" / NAMES[1], DIAGONAL)
         write_image(root / "masks" / NAMES[2], np.zeros((48, 64, 3), dtype=np.uint8))
     store = ImageStore(load_capture(root))
-    with pytest.warns(UserWarning, match="1 photographs have no pixel that counts.*first: 2.png"):
-        store.check_files(range(4)).wait()
+    warned(
+        "1 photographs have no pixel that counts.*first: 2.png", lambda: store.check_files(range(4)).wait()
+    )
 
 
 def test_a_header_beyond_the_first_bytes_is_found(tmp_path):

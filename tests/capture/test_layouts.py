@@ -16,6 +16,7 @@ from tests.capture.helpers import (
     edit_model,
     frame,
     smooth_image,
+    warned,
     write_capture,
     write_image,
     write_ply,
@@ -98,8 +99,7 @@ def test_blender_transforms(tmp_path):
         frames.append(frame(f"./train/r_{i}", at(i, 0, 4)))
     for part, own in (("train", frames[:2]), ("test", frames[2:])):
         write_transforms(tmp_path, own, f"transforms_{part}.json", camera_angle_x=0.8)
-    with pytest.warns(UserWarning, match="no points"):
-        capture = load_capture(tmp_path)
+    capture = warned("no points", load_capture, tmp_path)
     assert (capture.train, capture.test, capture.has_alpha) == ([0, 1], [2], True)
     camera = capture.cameras[0]
     assert camera.K[0, 0] == pytest.approx(15 / np.tan(0.4)) and camera.K[0, 2] == 15

@@ -137,10 +137,8 @@ def test_an_overview_that_shows_the_scene_is_kept_but_decides_on_no_length(tmp_p
     rotations[STRAY], centres[STRAY] = look_at_origin(at)[:3, :3], at
     write(tmp_path, "binary", rotations, centres, points)
     capture, said = quiet_load(tmp_path)
-    assert (
-        len(capture.cameras) == COUNT and capture.apart == [STRAY] and not capture.about.strays and not said
-    )
-    assert capture.extent < 6
+    assert len(capture.cameras) == COUNT and capture.apart == [STRAY] and capture.extent < 6
+    assert not capture.about.strays and not said
 
 
 def test_two_groups_of_cameras_are_no_strays(tmp_path):

@@ -11,7 +11,7 @@ from blitzgs.capture.capture import load_capture
 from blitzgs.capture.image_files import decode_mask, decode_rgb, described, read_header
 from blitzgs.capture.images import ImageStore
 from blitzgs.capture.masks import find_masks
-from tests.capture.helpers import png, smooth_image, tiff, write_capture, write_image
+from tests.capture.helpers import png, smooth_image, tiff, warned, write_capture, write_image
 from tests.helpers import refused
 
 SHAPE = (48, 64)
@@ -109,8 +109,7 @@ def test_masks_without_effect_are_said(tmp_path, name, mask, message):
     (root / "masks").mkdir()
     for file in names:
         cv2.imwrite(str(root / "masks" / file), mask.astype(np.uint8))
-    with pytest.warns(UserWarning, match=message):
-        load_capture(root)
+    warned(message, load_capture, root)
 
 
 # Names of images, files below masks/, and for each image its file (None: it has none).
@@ -384,8 +383,7 @@ def test_unused_bands_are_said_at_load_and_alpha_is_counted(tmp_path):
     pixels = np.full((48, 64, 4), (200, 100, 50, 128), dtype=np.uint8)
     for name, extra in (("a.tif", 0), ("b.tif", 2), ("c.tif", 1)):
         (root / "images" / name).write_bytes(tiff(pixels, extra))
-    with pytest.warns(UserWarning, match=r"1 of 3 photographs have a further band .*first: a.tif.*not used"):
-        capture = load_capture(root)
+    capture = warned(r"1 of 3 photographs have a further band .*first: a.tif.*not used", load_capture, root)
     about = capture.about
     assert (capture.has_alpha, about.with_alpha, about.extra_bands) == (True, 2, 1)
     store = ImageStore(capture, background=(0.0, 0.0, 0.0))

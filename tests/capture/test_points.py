@@ -14,7 +14,7 @@ from blitzgs.capture.layouts import read_layout
 from blitzgs.capture.points import file_points
 from blitzgs.formats.ply import read_point_cloud
 from tests.capture import helpers as files
-from tests.capture.helpers import as_text, frame, write_capture, write_ply, write_transforms
+from tests.capture.helpers import as_text, frame, warned, write_capture, write_ply, write_transforms
 from tests.helpers import refused
 
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -151,8 +151,7 @@ def test_any_other_cloud_beside_transforms_is_named(tmp_path):
     transforms_capture(tmp_path)
     (tmp_path / "colmap").rename(tmp_path / "other")
     write_ply(tmp_path / "cloud.ply", POSITIONS, COLORS)
-    with pytest.warns(UserWarning, match='cloud.ply beside it is not used.*"ply_file_path": "cloud.ply"'):
-        load_capture(tmp_path)
+    warned('cloud.ply beside it is not used.*"ply_file_path": "cloud.ply"', load_capture, tmp_path)
 
 
 def test_points_without_colours_are_said(tmp_path):
@@ -250,13 +249,11 @@ def test_points_in_world_coordinates_and_cameras_without_the_offset(tmp_path):
     capture = files.Posed(origin=UTM)
     files.pix4d(capture, capture.write_images(tmp_path) / "params", UTM)
     write_las(tmp_path / "cloud.las", capture.points)
-    with pytest.warns(UserWarning, match="the points are in coordinates of WGS 84 / UTM zone 33N"):
-        loaded = load_capture(tmp_path)
+    loaded = warned("the points are in coordinates of WGS 84 / UTM zone 33N", load_capture, tmp_path)
     np.testing.assert_allclose(loaded.points + loaded.offset, capture.points - UTM, atol=1e-4)
     assert loaded.colors.tolist() == [[128] * 3] * 40
     (tmp_path / "other.laz").write_bytes(b"")
-    with pytest.warns(UserWarning, match="2 files of points .* call one of them points.las"):
-        load_capture(tmp_path)
+    warned("2 files of points .* call one of them points.las", load_capture, tmp_path)
 
 
 def test_a_colmap_model_takes_points_and_an_offset_from_files_beside_it(tmp_path):

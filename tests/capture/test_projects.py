@@ -27,9 +27,7 @@ def _quiet():
 def residual(capture, views, points=None):
     """Largest distance in pixels of the capture's points, `points` in the coordinates of the views."""
     points = capture.points if points is None else points
-    assert [view.name.removesuffix(".JPG") for view in views] == [
-        n.removesuffix(".JPG") for n in capture.names
-    ]
+    assert [view.name for view in views] == capture.names
     worst = 0.0
     for index, view in enumerate(views):
         x, y, z = view.world_to_camera[:3, :3] @ points.T + view.world_to_camera[:3, 3:]
@@ -54,10 +52,8 @@ def test_metashape(tmp_path):
     np.testing.assert_allclose(source.frame.to_world(local), capture.points, atol=1e-8)
     np.testing.assert_allclose(source.frame.from_world(capture.points), local, atol=1e-8)
     assert any("1 photographs of the project have no pose" in note for note in source.notes)
-    text = (tmp_path / "cameras.xml").read_text()
-    (tmp_path / "cameras.xml").write_text(
-        text.replace(' component_id="2"', "").replace('id="3" ', 'id="3" enabled="false" ')
-    )
+    text = (tmp_path / "cameras.xml").read_text().replace(' component_id="2"', "")
+    (tmp_path / "cameras.xml").write_text(text.replace('id="3" ', 'id="3" enabled="false" '))
     views, _, again = read(tmp_path)
     assert len(views) == 5 and again.frame.scale == source.frame.scale
 
@@ -108,15 +104,11 @@ def test_realitycapture_with_the_points_of_a_bundle(tmp_path, separator, header)
 
 
 def test_realitycapture_angles_are_those_of_its_help(tmp_path):
-    rows = [
-        ["down.jpg", 0, 0, 0], ["down_east.jpg", 90, 0, 0], ["north.jpg", 0, 90, 0], ["east.jpg", 90, 90, 0],
-    ]  # fmt: skip
-    text = "#name,heading,pitch,roll,x,y,alt,f\n"
-    text += "".join(",".join(map(str, row)) + ",1,2,3,30\n" for row in rows)
-    (tmp_path / "r.csv").write_text(text)
-    right, down, forward = np.stack(
-        [v.world_to_camera[:3, :3] for v in read_realitycapture(tmp_path / "r.csv").views], axis=1
-    )
+    angles = {"down.jpg": "0,0", "down_east.jpg": "90,0", "north.jpg": "0,90", "east.jpg": "90,90"}
+    rows = [f"{name},{angle},0,1,2,3,30\n" for name, angle in angles.items()]
+    (tmp_path / "r.csv").write_text("#name,heading,pitch,roll,x,y,alt,f\n" + "".join(rows))
+    views = read_realitycapture(tmp_path / "r.csv").views
+    right, down, forward = np.stack([view.world_to_camera[:3, :3] for view in views], axis=1)
     np.testing.assert_allclose(forward, [[0, 0, -1], [0, 0, -1], [0, 1, 0], [1, 0, 0]], atol=1e-12)
     np.testing.assert_allclose(-down, [[0, 1, 0], [1, 0, 0], [0, 0, 1], [0, 0, 1]], atol=1e-12)
     np.testing.assert_allclose(right[:2], [[1, 0, 0], [0, -1, 0]], atol=1e-12)
@@ -186,15 +178,14 @@ def test_opendronemap_offset_or_its_topocentric_original(tmp_path):
 
 def test_a_label_without_a_suffix_finds_its_photograph_in_a_folder(tmp_path):
     capture = files.Posed(names=[f"flight_1/a{i}.JPG" for i in range(6)])
-    files.metashape(
-        capture, capture.write_images(tmp_path) / "export.xml", labels=[f"a{i}" for i in range(6)]
-    )
+    path = capture.write_images(tmp_path) / "export.xml"
+    files.metashape(capture, path, labels=[f"A{i}" for i in range(6)])
     loaded = load_capture(tmp_path / "export.xml")
     assert [camera.image_path.name for camera in loaded.cameras] == [f"a{i}.JPG" for i in range(6)]
     assert loaded.cameras[0].name == "flight_1/a0.JPG"
     (images := tmp_path / "images").joinpath("flight_2").mkdir()
     shutil.copy(images / "flight_1/a0.JPG", images / "flight_2")
-    with pytest.raises(ValueError, match=r"2 files could be the photograph a0 \(flight_1/a0.JPG, flight_2/a"):
+    with pytest.raises(ValueError, match=r"2 files could be the photograph A0 \(flight_1/a0.JPG, flight_2/a"):
         load_capture(tmp_path / "export.xml")
     shutil.copy(images / "flight_1/a0.JPG", images)
     assert load_capture(tmp_path / "export.xml").cameras[0].name == "a0.JPG"

@@ -15,6 +15,7 @@ from tests.capture.helpers import (
     frame,
     reconstruction,
     smooth_image,
+    warned,
     write_capture,
     write_image,
     write_transforms,
@@ -180,9 +181,8 @@ def test_the_files_of_blenders_split_are_all_read(tmp_path, parts):
         refused(ValueError, "the capture's own split leaves no training view of", load_capture, tmp_path)
         return
     train, test, capture = split_of(tmp_path)
-    assert train == names["train"] and test == [
-        n for part in ("val", "test") if part in parts for n in names[part]
-    ]
+    assert train == names["train"]
+    assert test == [name for part in ("val", "test") if part in parts for name in names[part]]
     assert capture.about.split_from == " and ".join(f"transforms_{part}.json" for part in parts)
 
 
@@ -190,8 +190,7 @@ def test_what_is_beside_transforms_json_is_named(tmp_path):
     write_images(tmp_path)
     write(tmp_path)
     write(tmp_path, "transforms_val.json", FRAMES[:1])
-    with pytest.warns(UserWarning, match="transforms.json is read, and transforms_val.json beside it not"):
-        load_capture(tmp_path)
+    warned("transforms.json is read, and transforms_val.json beside it not", load_capture, tmp_path)
 
 
 def models(root, counts, text=False):
@@ -209,10 +208,8 @@ def models(root, counts, text=False):
 def test_the_largest_of_several_models_is_read(tmp_path, counts, text):
     models(tmp_path, counts, text)
     best = counts.index(max(counts))
-    with pytest.warns(
-        UserWarning, match=f"of {len(counts)} COLMAP models, the largest is used: sparse/{best} "
-    ):
-        capture = load_capture(tmp_path)
+    message = f"of {len(counts)} COLMAP models, the largest is used: sparse/{best} "
+    capture = warned(message, load_capture, tmp_path)
     assert len(capture.cameras) == max(counts) and capture.about.cameras == f"sparse/{best}"
     other = len(counts) - 1
     named = load_capture(tmp_path, sparse=f"sparse/{other}")

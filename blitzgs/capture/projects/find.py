@@ -139,7 +139,7 @@ def _with_suffixes(folder: Path, root: Path, names: Sequence[str]) -> list[str]:
     for name in names:
         has_suffix = PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES
         fits = [] if has_suffix else [files[index] for index in known.get(any_case(name), [])]
-        fits = [file for file in fits if str(PurePosixPath(file).with_suffix("")) == name] or fits
+        fits = [file for file in fits if any_case(file).rpartition(".")[0] == any_case(name)] or fits
         if len(fits) > 1:
             shown = ", ".join(fits[:3])
             raise ValueError(f"{base}: {len(fits)} files could be the photograph {name} ({shown}): keep one")
