@@ -9,6 +9,7 @@ axis) and marks the rest.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -232,6 +233,12 @@ class SourceView:
     # two that exclude each other; None if they do not say.
     part: str | None = None
 
+    def pose_from(self, origin: Float64) -> Float64:
+        """Return the pose [4, 4] in the world whose origin was moved to `origin` [3]."""
+        pose = self.world_to_camera.copy()
+        pose[:3, 3] += pose[:3, :3] @ origin
+        return pose
+
     def pixels_of(self, points: Float64) -> Float64:
         """Return the pixels [S, 2] at which the view shows points [M, 3], occluded ones too; others not."""
         x, y, depth = self.world_to_camera[:3, :3] @ points.T + self.world_to_camera[:3, 3:]
@@ -240,6 +247,14 @@ class SourceView:
             pixels = np.stack(self.lens.project(x[front] / depth[front], y[front] / depth[front]), axis=1)
             inside = (pixels >= 0) & (pixels < [self.lens.width, self.lens.height])
         return np.asarray(pixels[inside.all(axis=1)])
+
+
+def pose_of(camera_to_world: Float64, centre: Float64 | Sequence[float]) -> Float64:
+    """Return world to camera [4, 4] of a camera's axes in the world (columns of [3, 3]) and its centre."""
+    pose = np.eye(4)
+    pose[:3, :3] = camera_to_world.T
+    pose[:3, 3] = -camera_to_world.T @ np.asarray(centre)
+    return pose
 
 
 def camera_centres(world_to_camera: Float64) -> Float64:

@@ -288,14 +288,12 @@ def _camera(
             f"downscale {downscale} leaves {size[0]} x {size[1]} pixels of {view.path}, which is {width} x "
             f"{height}: choose a smaller one"
         )
-    pose = view.world_to_camera.copy()
-    pose[:3, 3] += pose[:3, :3] @ offset
     return Camera(
         name=view.name,
         width=size[0],
         height=size[1],
         K=scaled_matrix(plan.K, (plan.width, plan.height), size),
-        world_to_camera=pose,
+        world_to_camera=view.pose_from(offset),
         image_path=view.path,
         mask_path=view.mask_path,
         orientation=orientation,

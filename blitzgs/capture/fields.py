@@ -17,19 +17,24 @@ import numpy.typing as npt
 
 Fields = Mapping[str, Any]
 # Larger than the projects of a hundred thousand photographs.
-_MAX_BYTES = 4 << 30
+_MOST = 4 << 30
 
 
-def read_bytes(path: Path) -> bytes:
-    """Return the content of a file (ValueError: it is larger than any project)."""
-    if path.stat().st_size > _MAX_BYTES:
-        raise ValueError(f"larger than {_MAX_BYTES:,} bytes: no project is")
+def read_bytes(path: Path, most: int = _MOST) -> bytes:
+    """Return the content of a file (ValueError: it is larger than such files are)."""
+    if path.stat().st_size > most:
+        raise ValueError(f"{path} is larger than {most:,} bytes, which such a file never is")
     return path.read_bytes()
 
 
-def read_text(path: Path) -> str:
+def read_text(path: Path, most: int = _MOST) -> str:
     """Return the text of a file; errors as `read_bytes`."""
-    return read_bytes(path).decode("utf-8-sig", errors="replace")
+    return read_bytes(path, most).decode("utf-8-sig", errors="replace")
+
+
+def read_small(path: Path) -> str:
+    """Return the text of a file of at most a megabyte."""
+    return read_text(path, 1 << 20)
 
 
 def read_json(path: Path) -> Any:

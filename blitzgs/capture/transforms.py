@@ -14,7 +14,7 @@ from pathlib import Path, PurePath
 
 import numpy as np
 
-from blitzgs.capture.cameras import Float64, SourceView
+from blitzgs.capture.cameras import Float64, SourceView, pose_of
 from blitzgs.capture.fields import Fields, entry, read_json
 from blitzgs.capture.names import find_files
 from blitzgs.capture.transforms_lens import FIELDS, read_lens
@@ -183,7 +183,6 @@ def _read_pose(matrix: object) -> Float64:
         raise ValueError("transform_matrix must be 4 x 4 numbers") from error
     if camera_to_world.shape not in ((3, 4), (4, 4)):
         raise ValueError(f"transform_matrix must be 4 x 4, got the shape {camera_to_world.shape}")
-    pose = np.eye(4)
     rotation = camera_to_world[:3, :3] * np.array([1.0, -1.0, -1.0])
     if np.isfinite(camera_to_world).all():  # views whose pose is not finite are dropped later
         lengths = np.linalg.norm(rotation, axis=0)
@@ -203,6 +202,4 @@ def _read_pose(matrix: object) -> Float64:
             raise ValueError("transform_matrix is not a rotation and a translation")
         if np.linalg.det(rotation) < 0:
             raise ValueError("transform_matrix mirrors the scene: one of its axes has the wrong sign")
-    pose[:3, :3] = rotation.T
-    pose[:3, 3] = -rotation.T @ camera_to_world[:3, 3]
-    return pose
+    return pose_of(rotation, camera_to_world[:3, 3])

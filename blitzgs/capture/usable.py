@@ -114,6 +114,5 @@ def read_cameras(path: Path, offset: Float64) -> list[Camera]:
 def _pinhole(view: SourceView, offset: Float64) -> Camera:
     with located(f"the camera of {view.name}"):
         plan = rectify(view.lens, "crop")
-    pose = view.world_to_camera.copy()
-    pose[:3, 3] += pose[:3, :3] @ offset
+    pose = view.pose_from(offset)
     return Camera(view.name, plan.width, plan.height, plan.K, pose, view.path, None, 1, plan)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from blitzgs.capture.cameras import Float64
+from blitzgs.capture.fields import read_small
 from blitzgs.util.errors import optional_package
 
 # The file of a run, and of a capture whose world its own files do not say.
@@ -24,7 +25,6 @@ GEO = "geo.json"
 GEOCENTRIC = "EPSG:4978"
 # The smaller spread of points, as a share of the larger, from which a similarity has no free turn left.
 _LEAST_WIDTH = 1e-3
-_MAX_BYTES = 1 << 20
 # WGS 84: the major axis in metres, and the square of the eccentricity.
 _AXIS, _E2 = 6378137.0, (2 - 1 / 298.257223563) / 298.257223563
 
@@ -117,15 +117,6 @@ def read_world_frame(path: Path) -> WorldFrame:
         return WorldFrame(crs, float(scale), rotation, translation, str(path.name))
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path} is damaged ({error}): write it again with blitzgs align") from error
-
-
-def read_small(path: Path) -> str:
-    """Return the text of a file of at most a megabyte."""
-    with open(path, "rb") as file:
-        content = file.read(_MAX_BYTES + 1)
-    if len(content) > _MAX_BYTES:
-        raise ValueError(f"{path} is larger than {_MAX_BYTES:,} bytes, which such a file never is")
-    return content.decode("utf-8-sig", errors="replace")
 
 
 def frame_beside(root: Path) -> WorldFrame | None:

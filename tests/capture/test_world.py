@@ -228,10 +228,8 @@ def test_both_files_of_points_are_read(setting, tmp_path):
     [
         ("name,E,N,image,x,y\n", "line 1: the columns h are missing"),
         ("name,E,N,h,image,x,y\nA,1,2,3,i.jpg,4\n", "line 2: 6 values in 7 columns"),
-        (
-            "name,E,N,h,image,x,y\nA,1,2,nan,i.jpg,4,5\n",
-            "line 2: a name, an image or a finite number is missing",
-        ),
+        ("name,E,N,h,image,x,y\nA,1,2,nan,i.jpg,4,5\n", "line 2: h must be a finite number, got 'nan'"),
+        ("name,E,N,h,image,x,y\nA,1,2,3,,4,5\n", "line 2: a name or an image is missing"),
         ("name,E,N,h,image,x,y\nA,1,2,3,i.jpg,4,5\nA,1,2,9,j.jpg,4,5\n", "line 3: A has another place"),
         ("EPSG:32633\n1 2 3 4 5\n", "line 2: expected E, N, h, x, y and an image"),
         ("EPSG:32633\n", "no points: expected the columns"),

@@ -7,7 +7,7 @@ it names the place in the file.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import cv2
@@ -45,21 +45,12 @@ class Project:
     notes: list[str] = field(default_factory=list)
 
 
-def pose_of(camera_to_world: Float64, centre: Sequence[float] | Float64) -> Float64:
-    """Return world to camera [4, 4] of a camera's axes in the world [3, 3] (as columns) and its centre."""
-    check_rotation(camera_to_world)
-    pose = np.eye(4)
-    pose[:3, :3] = camera_to_world.T
-    pose[:3, 3] = -camera_to_world.T @ np.asarray(centre)
-    return pose
-
-
-def check_rotation(matrix: Float64) -> None:
-    """Refuse a matrix [3, 3] that is no rotation; one of NaN passes, and its view is dropped later."""
-    if np.isnan(matrix).any():
-        return
-    if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-4) or np.linalg.det(matrix) < 0:
+def rotation_of(matrix: Float64) -> Float64:
+    """Return a matrix [3, 3]; ValueError: it is no rotation. Views of NaN are dropped later."""
+    is_one = np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-4) and np.linalg.det(matrix) > 0
+    if not is_one and not np.isnan(matrix).any():
         raise ValueError(f"no rotation: {np.round(matrix, 6).tolist()}; export the project again")
+    return matrix
 
 
 def turn(axis: str, degrees: float) -> Float64:

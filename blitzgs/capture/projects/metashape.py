@@ -21,9 +21,10 @@ from xml.parsers import expat
 
 import numpy as np
 
+from blitzgs.capture.cameras import pose_of
 from blitzgs.capture.fields import image_size, number, numbers, read_bytes
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.projects import Project, ProjectView, check_rotation, made_lens, pose_of
+from blitzgs.capture.projects import Project, ProjectView, made_lens, rotation_of
 from blitzgs.capture.world import GEOCENTRIC, WorldFrame
 from blitzgs.util.errors import located
 
@@ -56,7 +57,7 @@ def read_metashape(path: Path) -> Project:
             if not label or sensor_id not in sensors:
                 raise ValueError(f"no label, or its sensor {sensor_id} is not there; export it again")
             matrix = numbers(_texts(camera), "transform", 16).reshape(4, 4)
-            pose = pose_of(matrix[:3, :3], matrix[:3, 3])
+            pose = pose_of(rotation_of(matrix[:3, :3]), matrix[:3, 3])
         if sensor_id not in lenses:
             with located(f"sensor {sensor_id}"):
                 lenses[sensor_id] = _lens(sensors[sensor_id])
@@ -140,8 +141,7 @@ def _frame(chunk: Element, component: str | None, path: Path) -> WorldFrame | No
     if transform is None or transform.find("rotation") is None:
         return None
     values = {"translation": "0 0 0", **_texts(transform)}
-    rotation = numbers(values, "rotation", 9).reshape(3, 3)
-    check_rotation(rotation)
+    rotation = rotation_of(numbers(values, "rotation", 9).reshape(3, 3))
     reference = (chunk.findtext("reference") or "").strip()
     local = not reference or reference.upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS"))
     # Rounded numbers of the file make the rotation one to about 1e-7 only.

@@ -22,11 +22,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from blitzgs.capture.fields import entry, image_size, number, numbers, read_json
+from blitzgs.capture.fields import entry, image_size, number, numbers, read_json, read_small
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.points import SourcePoints
-from blitzgs.capture.projects import Project, ProjectView, made_lens, pose_of
-from blitzgs.capture.world import WorldFrame, enu_frame, read_small, utm_of_text
+from blitzgs.capture.projects import Project, ProjectView, made_lens
+from blitzgs.capture.world import WorldFrame, enu_frame, utm_of_text
 from blitzgs.util.errors import located
 
 NAME, ORIGINAL = "reconstruction.json", "reconstruction.topocentric.json"
@@ -62,8 +62,9 @@ def read_opensfm(path: Path) -> Project:
             key = entry(shot, "camera", str)
             if key not in lenses:
                 raise ValueError(f"its camera {key!r:.60} is not there")
-            rotation = np.asarray(cv2.Rodrigues(numbers(shot, "rotation", 3))[0], dtype=np.float64)
-            pose = pose_of(rotation.T, -rotation.T @ numbers(shot, "translation", 3))
+            pose = np.eye(4)
+            pose[:3, :3] = cv2.Rodrigues(numbers(shot, "rotation", 3))[0]
+            pose[:3, 3] = numbers(shot, "translation", 3)
         views.append(ProjectView(name, lenses[key], pose))
     return Project(views, _points(best, path), _frame(path, best), sum(counts) - max(counts), notes)
 

@@ -26,9 +26,10 @@ from urllib.parse import unquote, urlparse
 
 import numpy as np
 
+from blitzgs.capture.cameras import pose_of
 from blitzgs.capture.fields import entry, image_size, number, numbers, read_json, read_text
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.projects import Project, ProjectView, made_lens, pose_of, turn
+from blitzgs.capture.projects import Project, ProjectView, made_lens, rotation_of, turn
 from blitzgs.capture.world import WorldFrame, read_offset
 from blitzgs.util.errors import located
 
@@ -63,7 +64,7 @@ def read_pix4d(path: Path) -> Project:
             distortion = (*radial, 0.0, *tangential, skew / fx if fx else 0.0)
             lens = made_lens("BROWN", image_size(fields), fx, fy, cx, cy, *distortion)
             rotation = np.stack([numbers(fields, row, 3) for row in _R])
-            pose = pose_of(rotation.T, numbers(fields, "camera position", 3))
+            pose = pose_of(rotation_of(rotation.T), numbers(fields, "camera position", 3))
         views.append(ProjectView(words[0], lens, pose))
     return Project(views, None, _frame(path))
 

@@ -28,11 +28,11 @@ from pathlib import Path
 
 import numpy as np
 
-from blitzgs.capture.cameras import Float64
+from blitzgs.capture.cameras import Float64, pose_of
 from blitzgs.capture.fields import number, read_bytes, read_text
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.points import SourcePoints
-from blitzgs.capture.projects import Project, ProjectView, made_lens, pose_of, turn
+from blitzgs.capture.projects import Project, ProjectView, made_lens, rotation_of, turn
 from blitzgs.util.errors import located
 
 _NEEDED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
@@ -124,7 +124,7 @@ def read_bundler(path: Path) -> Project:
             continue
         rotation = row[3:12].reshape(3, 3)
         with located(f"camera {index} ({names[index]})"):
-            pose = pose_of(rotation.T * [1, -1, -1], -rotation.T @ row[12:15])
+            pose = pose_of(rotation_of(rotation.T * [1, -1, -1]), -rotation.T @ row[12:15])
         views.append(ProjectView(names[index], functools.partial(_bundle_lens, row[:3]), pose))
     return Project(views, _points(path, lines[5 * cameras :], points), lost=cameras - len(views))
 
