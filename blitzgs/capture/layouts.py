@@ -8,7 +8,7 @@ import shlex
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -114,7 +114,7 @@ def _hint(root: Path) -> str:
             f"move the model to {root / 'sparse' / '0'}"
         )
     names = [path.name for path in (*root.glob("*"), *root.glob("*/*"))]
-    if any(PurePath(name).suffix.lower() in IMAGE_SUFFIXES for name in names):
+    if any(name.lower().endswith(IMAGE_SUFFIXES) for name in names):
         return (
             f"; it has images but not their cameras: blitzgs sfm {shlex.quote(str(root))} CAPTURE finds these"
         )

@@ -48,7 +48,7 @@ def find_masks(
         if masks is not None:
             raise FileNotFoundError(f"{folder}: no such folder of masks")
         return list(given)
-    files = [name for name in files_below(folder) if PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES]
+    files = [name for name in files_below(folder) if name.lower().endswith(IMAGE_SUFFIXES)]
     owners = _owners(folder, files, [None if path else name for name, path in zip(names, given, strict=True)])
     found = [path or (folder / owners[i] if i in owners else None) for i, path in enumerate(given)]
     used = {path for path in found if path is not None}

@@ -12,7 +12,7 @@ import re
 import stat
 import unicodedata
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from pathlib import Path, PurePath, PurePosixPath
 
 from blitzgs.capture.cameras import SourceView
@@ -87,24 +87,16 @@ def match_names(names: Iterable[str], found: Sequence[str], folder: Path) -> dic
     if not wanted or not folder.is_dir():
         return {}
     taken = {unified(name) for name in found}
-    suffixes = {PurePosixPath(unified(name)).suffix.lower() for name in found}
+    suffixes = {_suffix(name) for name in found}
     free = [file for file in files_below(folder) if unified(file) not in taken]
     matches: dict[str, Path] = {}
     for ignored, key, is_last_resort in _RULES:
-        files, claims = defaultdict(list), defaultdict(list)
-        for file in free:
-            if not (is_last_resort and file.lower().endswith(_CONVERTED_SUFFIXES)):
-                files[key(file)].append(file)
-        for name in wanted:
-            if not (is_last_resort and PurePosixPath(unified(name)).suffix.lower() in suffixes):
-                claims[key(name)].append(name)
+        files = _alone(free, key, _CONVERTED_SUFFIXES if is_last_resort else ())
+        claims = _alone(wanted, key, suffixes if is_last_resort else ())
         new = {
-            claimed[0]: files[place][0]
-            for place, claimed in claims.items()
-            if _is_alike(claimed[0], files.get(place, [""])[0])
-            and len(claimed) == 1
-            and len(files.get(place, ())) == 1
-            and (folder / files[place][0]).is_file()
+            name: files[place]
+            for place, name in claims.items()
+            if place in files and _is_alike(name, files[place]) and (folder / files[place]).is_file()
         }
         if not new:
             continue
@@ -117,10 +109,21 @@ def match_names(names: Iterable[str], found: Sequence[str], folder: Path) -> dic
         used = set(new.values())
         free = [file for file in free if file not in used]
         wanted = [name for name in wanted if name not in new]
-        suffixes |= {PurePosixPath(unified(name)).suffix.lower() for name in new}
-        if not wanted:
-            break
+        suffixes |= {_suffix(name) for name in new}
     return matches
+
+
+def _alone(names: Iterable[str], key: Callable[[str], str], without: Container[str]) -> dict[str, str]:
+    """Return the names whose key no other one has, by their keys; not those of some suffixes."""
+    groups = defaultdict(list)
+    for name in names:
+        if _suffix(name) not in without:
+            groups[key(name)].append(name)
+    return {place: some[0] for place, some in groups.items() if len(some) == 1}
+
+
+def _suffix(name: str) -> str:
+    return PurePosixPath(any_case(name)).suffix
 
 
 def _is_alike(name: str, file: str) -> bool:

@@ -36,7 +36,7 @@ def photograph_folder(root: Path, images: str = "images") -> Path:
 
 def _photographs_of(files: Iterable[str]) -> list[str]:
     """Return the photographs among files; by-products are left out."""
-    found = (name for name in files if PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES)
+    found = (name for name in files if name.lower().endswith(IMAGE_SUFFIXES))
     return [name for name in found if not _BY_PRODUCT.search(name)]
 
 

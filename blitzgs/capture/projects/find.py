@@ -131,15 +131,15 @@ def _relative(name: str) -> str:
 
 def _with_suffixes(folder: Path, root: Path, names: Sequence[str]) -> list[str]:
     """Complete names without a suffix, as Metashape's labels are (ValueError: several files fit one)."""
-    if all(PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES for name in names):
+    if all(name.lower().endswith(IMAGE_SUFFIXES) for name in names):
         return list(names)
     base = folder if folder.is_dir() else root
-    files = [file for file in files_below(base) if PurePosixPath(file).suffix.lower() in IMAGE_SUFFIXES]
+    files = [file for file in files_below(base) if file.lower().endswith(IMAGE_SUFFIXES)]
     known, found = by_parts(files), []
     for name in names:
-        has_suffix = PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES
-        fits = [] if has_suffix else [files[index] for index in known.get(any_case(name), [])]
-        fits = [file for file in fits if any_case(file).rpartition(".")[0] == any_case(name)] or fits
+        key = any_case(name)
+        fits = [] if key.endswith(IMAGE_SUFFIXES) else [files[index] for index in known.get(key, [])]
+        fits = [file for file in fits if any_case(file).rpartition(".")[0] == key] or fits
         if len(fits) > 1:
             shown = ", ".join(fits[:3])
             raise ValueError(f"{base}: {len(fits)} files could be the photograph {name} ({shown}): keep one")
