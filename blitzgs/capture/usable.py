@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from blitzgs.capture import transforms
-from blitzgs.capture.cameras import Camera, Float64, SourceView, rectify
+from blitzgs.capture.cameras import Camera, Float64, SourceView, camera_centres, rectify
 from blitzgs.capture.layouts import read_layout
-from blitzgs.capture.lengths import StrayCamera, random_points
+from blitzgs.capture.lengths import LEAST_SPREAD, StrayCamera
 from blitzgs.capture.lens import Lens, check_lens
 from blitzgs.capture.points import SourcePoints
 from blitzgs.util.errors import located, warn
@@ -82,13 +82,29 @@ def finite_points(points: SourcePoints) -> SourcePoints:
 
 
 def points_at_random(root: Path, cameras: Sequence[Camera], offset: Float64) -> SourcePoints:
-    """Return uniform points of random colours in the region that the cameras look at."""
+    """Return uniform points of random colours in the region that the cameras look at (ValueError: none)."""
     warn(
         f"{root}: the capture has no points; {_RANDOM_POINTS:,} random ones take their place. Points of the "
         "reconstruction give a better start"
     )
-    with located(str(root)):
-        return SourcePoints(*random_points(cameras, offset, _RANDOM_POINTS))
+    poses = np.stack([camera.world_to_camera for camera in cameras])
+    centres, axes = camera_centres(poses), poses[:, 2, :3]
+    # The point nearest to all optical axes by least squares; the tiny term keeps parallel axes solvable.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    target = np.linalg.solve(
+        across.sum(axis=0) + 1e-6 * np.eye(3),
+        np.einsum("nij,nj->i", across, centres) + 1e-6 * centres.mean(axis=0),
+    )
+    half = 0.35 * float(np.linalg.norm(centres - target, axis=1).mean())
+    # Files state coordinates of a map, with offsets of millions of metres, to a millimetre.
+    if half <= LEAST_SPREAD * (1 + 1e-3 * float(np.abs(offset).max())):
+        raise ValueError(
+            f"{root}: the capture has no points and all its cameras are in one place, so the position of the "
+            "scene is unknown: add points to the capture"
+        )
+    random, shape = np.random.default_rng(0), (_RANDOM_POINTS, 3)
+    positions = target + offset + random.uniform(-half, half, shape)
+    return SourcePoints(positions, random.integers(0, 256, shape, dtype=np.uint8))
 
 
 def read_cameras(path: Path, offset: Float64) -> list[Camera]:
