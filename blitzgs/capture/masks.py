@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 
 from blitzgs.capture.cameras import Camera, same_shape
 from blitzgs.capture.image_files import check_photograph, decode_mask, in_threads, read_header, read_whole
-from blitzgs.capture.names import IMAGE_SUFFIXES, files_below, unified, what_is_at
+from blitzgs.capture.names import IMAGE_SUFFIXES, any_case, files_below, unified, what_is_at
 from blitzgs.util.errors import located, warn
 
 # What programs call the mask of a.jpg, the names that are tried first first.
@@ -72,26 +72,22 @@ def _owners(folder: Path, files: Sequence[str], names: Sequence[str | None]) -> 
     """
     by_path: dict[str, list[str]] = defaultdict(list)
     for file in files:
-        parts = PurePosixPath(unified(file).casefold()).parts
+        parts = PurePosixPath(any_case(file)).parts
         for begin in range(len(parts)):
             by_path["/".join(parts[begin:])].append(file)
-    claims: dict[str, list[tuple[int, int]]] = defaultdict(list)  # by file: ranks and images
+    claims: dict[str, dict[int, int]] = defaultdict(dict)  # by file: the rank of each image
     for index, name in enumerate(names):
-        if name is None:
-            continue
-        seen: set[str] = set()
-        for rank, place in enumerate(_places(name)):
-            for file in by_path.get(place.casefold(), ()):
+        for rank, place in enumerate(_places(name) if name is not None else ()):
+            for file in by_path.get(place, ()):
                 # The folder of masks may have a folder in front of the whole name: half a rank worse.
-                exact = unified(file).casefold() == place.casefold()
-                if file not in seen and (exact or rank < _FORMS_OF_A_PLACE):
-                    seen.add(file)
-                    claims[file].append((2 * rank + (not exact), index))
+                exact = any_case(file) == place
+                if exact or rank < _FORMS_OF_A_PLACE:
+                    claims[file].setdefault(index, 2 * rank + (not exact))
     owners: dict[int, tuple[int, str]] = {}
     doubtful: list[tuple[str, list[int]]] = []
     for file, claimed in claims.items():
-        best = min(rank for rank, _ in claimed)
-        images = [index for rank, index in claimed if rank == best]
+        best = min(claimed.values())
+        images = [index for index, rank in claimed.items() if rank == best]
         if len(images) > 1:
             doubtful.append((file, images))
         elif images[0] not in owners or best < owners[images[0]][0]:
@@ -114,11 +110,11 @@ def _places(name: str) -> Iterator[str]:
     images. Of a name that is absolute or leads out of its folder, only the last part is used: the whole name,
     joined to the folder of masks, could be the path of the photograph itself.
     """
-    path = PurePosixPath(unified(name))
+    path = PurePosixPath(any_case(name))
     parts = path.parts[-1:] if path.is_absolute() or ".." in path.parts else path.parts
     for begin in range(len(parts)):
         # A PNG's own name is better than that stem's: a.png belongs to the image a.png before a.jpg.
-        for form in (_FORMS[0], "{name}" if path.suffix.lower() == ".png" else "", *_FORMS[1:]):
+        for form in (_FORMS[0], "{name}" if path.suffix == ".png" else "", *_FORMS[1:]):
             own = form.format(name=path.name, stem=path.stem, suffix=path.suffix)
             yield "/".join((*parts[begin:-1], own))
         for form, suffix in product(_FORMS_OF_ANY_SUFFIX, IMAGE_SUFFIXES):
