@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
+from typing import Any
 
 import numpy as np
 
@@ -100,20 +101,24 @@ def _read_file(root: Path, path: Path, read: Transforms) -> dict[str, None]:
     own = []
     for index, frame in enumerate(frames):
         with located(f"frame {index}"):
-            if not isinstance(frame, dict):
-                raise ValueError(f"must be an object with file_path and transform_matrix, got {frame!r:.40}")
-            path_of, mask = _file_name(frame, "file_path"), None
-            if frame.get("mask_path") is not None:
-                mask = paths[_file_name(frame, "mask_path")]
-            name, lens = _name(path_of), read_lens(content, frame, paths[path_of], read.notes)
-            pose = _read_pose(entry(frame, "transform_matrix", list))
-        part = _part(lists, name) if is_whole else "train" if path.name == "transforms_train.json" else "test"
-        own.append(SourceView(name, paths[path_of], mask, lens, pose, part))
+            view = _read_frame(content, frame, paths, read.notes)
+        part = "train" if path.name == "transforms_train.json" else "test"
+        own.append(replace(view, part=_part(lists, view.name) if is_whole else part))
     if lost := set().union(*lists.values()) - {frame.name for frame in own}:
         keys = " or ".join(f"{part}_filenames" for part in lists)
         raise ValueError(f"{keys} name {len(lost)} images that are no frames (first: {min(lost)})")
     read.frames += own
     return dict.fromkeys(key for level in (*frames, content) for key in level if key not in _KNOWN)
+
+
+def _read_frame(content: Fields, frame: Any, paths: Mapping[str, Path], notes: dict[str, None]) -> SourceView:
+    if not isinstance(frame, dict):
+        raise ValueError(f"must be an object with file_path and transform_matrix, got {frame!r:.40}")
+    relative = _file_name(frame, "file_path")
+    mask = None if frame.get("mask_path") is None else paths[_file_name(frame, "mask_path")]
+    lens = read_lens(content, frame, paths[relative], notes)
+    pose = _read_pose(entry(frame, "transform_matrix", list))
+    return SourceView(_name(relative), paths[relative], mask, lens, pose)
 
 
 def _applied(content: Fields) -> Float64 | None:

@@ -46,7 +46,7 @@ def read_pix4d(path: Path) -> Project:
     begin = next((i for i, line in enumerate(lines) if line.startswith("camera model")), None)
     if begin is None:
         raise ValueError("no header that ends in 'camera model ...'; export it again")
-    kept = [(number, line) for number, line in enumerate(lines[begin + 1 :], start=begin + 2) if line]
+    kept = [(place, line) for place, line in enumerate(lines[begin + 1 :], start=begin + 2) if line]
     count = 1 + len(_LINES)
     if len(kept) % count:
         raise ValueError(f"{len(kept)} lines are not {count} for each camera: it is cut off")
