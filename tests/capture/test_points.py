@@ -24,25 +24,18 @@ POSITIONS = np.random.default_rng(1).uniform(-1, 1, (COUNT, 3))
 C0 = 0.28209479177387814
 
 
-@pytest.mark.parametrize(
-    "names",
-    [
-        ("red", "green", "blue"),
-        ("Red", "Green", "Blue"),
-        ("RED", "GREEN", "BLUE"),
-        ("diffuse_red", "diffuse_green", "diffuse_blue"),
-        ("r", "g", "b"),
-        ("R", "G", "B"),
-        ("color_r", "color_g", "color_b"),
-    ],
-)
+WORDS = ("red green blue", "Red Green Blue", "RED GREEN BLUE", "r g b", "R G B", "color_r color_g color_b",
+         "diffuse_red diffuse_green diffuse_blue")  # fmt: skip
+
+
+@pytest.mark.parametrize("words", WORDS)
 @pytest.mark.parametrize("kind", ["u1", "i4", "u2", "f4", "f8", "fraction"])
-def test_colours_by_name_and_kind_of_number(tmp_path, names, kind):
+def test_colours_by_name_and_kind_of_number(tmp_path, words, kind):
     values = COLORS / 255 if kind == "fraction" else COLORS
-    path = write_ply(tmp_path / "a.ply", POSITIONS, values, names, "f4" if kind == "fraction" else kind)
-    cloud = read_point_cloud(path)
+    kind = "f4" if kind == "fraction" else kind
+    cloud = read_point_cloud(write_ply(tmp_path / "a.ply", POSITIONS, values, words.split(), kind))
     np.testing.assert_array_equal(cloud.colors, COLORS)
-    assert cloud.colors_from == ", ".join(name.lower() for name in names)
+    assert cloud.colors_from == words.lower().replace(" ", ", ")
 
 
 @pytest.mark.parametrize("kind", ["f4", "f8"])

@@ -2,7 +2,6 @@
 """Projects of other programs give the pixels, points and world of the capture that they were written from."""
 
 import shutil
-import warnings
 
 import numpy as np
 import pytest
@@ -14,14 +13,8 @@ from blitzgs.capture.projects.realitycapture import read_realitycapture
 from tests.capture import helpers as files
 from tests.helpers import refused
 
+pytestmark = pytest.mark.filterwarnings("ignore")
 UTM = np.array([412_345.0, 5_654_321.0, 120.0])
-
-
-@pytest.fixture(autouse=True)
-def _quiet():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
 
 
 def residual(capture, views, points=None):
