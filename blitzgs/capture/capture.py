@@ -257,12 +257,7 @@ def _with_masks(
 
 
 def _camera(
-    view: SourceView,
-    header: ImageHeader,
-    offset: Float64,
-    downscale: float,
-    policy: str,
-    exif: str,
+    view: SourceView, header: ImageHeader, offset: Float64, downscale: float, policy: str, exif: str
 ) -> Camera:
     orientation = _orientation(view, header, exif)
     width, height = (header.height, header.width) if orientation >= 5 else (header.width, header.height)

@@ -14,15 +14,7 @@ from blitzgs.capture.cameras import camera_centres, rectify
 from blitzgs.capture.capture import load_capture
 from blitzgs.capture.lengths import NEAR_OF_EXTENT
 from blitzgs.capture.lens import Lens
-from tests.capture.helpers import (
-    as_text,
-    at,
-    frame,
-    smooth_image,
-    write_image,
-    write_ply,
-    write_transforms,
-)
+from tests.capture.helpers import as_text, at, frame, smooth_image, write_image, write_ply, write_transforms
 from tests.helpers import look_at_origin, refused
 
 COUNT, W, H = 12, 64, 48

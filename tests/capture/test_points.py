@@ -24,11 +24,10 @@ POSITIONS = np.random.default_rng(1).uniform(-1, 1, (COUNT, 3))
 C0 = 0.28209479177387814
 
 
-WORDS = ("red green blue", "Red Green Blue", "RED GREEN BLUE", "r g b", "R G B", "color_r color_g color_b",
-         "diffuse_red diffuse_green diffuse_blue")  # fmt: skip
+WORDS = ["red green blue", "Red Green Blue", "RED GREEN BLUE", "r g b", "R G B", "color_r color_g color_b"]
 
 
-@pytest.mark.parametrize("words", WORDS)
+@pytest.mark.parametrize("words", [*WORDS, "diffuse_red diffuse_green diffuse_blue"])
 @pytest.mark.parametrize("kind", ["u1", "i4", "u2", "f4", "f8", "fraction"])
 def test_colours_by_name_and_kind_of_number(tmp_path, words, kind):
     values = COLORS / 255 if kind == "fraction" else COLORS
