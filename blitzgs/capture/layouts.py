@@ -64,7 +64,7 @@ def read_layout(
         )
     if project is not None:
         views, points, about = _read_project(root, project, images, downscale)
-        return views, points, _with_photographs(root, about, views)
+        return views, points, _with_photographs(about, views)
     models, notes = _models(root, sparse)
     folder = models[0] if models else None
     parts = {part: found[0][0] for part in ("train", "val") if (found := colmap.find_models(root / part))}
@@ -74,7 +74,7 @@ def read_layout(
         views, points, about = _read_transforms(root, folder)
     elif folder is not None:
         read = [_read_colmap(root, model, images, downscale) for model in models]
-        views, points = read[0] if len(read) == 1 else _joined(root, read)
+        views, points = read[0] if len(read) == 1 else _joined(read)
         shown = " and ".join(str(model.relative_to(root)) for model in models if model != root)
         about = About(shown or "cameras, images and points3D", "", tuple(notes))
     elif "train" in parts:
@@ -93,7 +93,7 @@ def read_layout(
         )
     if about.frame is None:
         about = replace(about, frame=frame_beside(root))
-    return views, points, _with_photographs(root, about, views)
+    return views, points, _with_photographs(about, views)
 
 
 def _read_project(
@@ -146,9 +146,7 @@ def _models(root: Path, sparse: str) -> tuple[list[Path], list[str]]:
     return [models[0][0]], [note]
 
 
-def _joined(
-    root: Path, parts: list[tuple[list[SourceView], SourcePoints]]
-) -> tuple[list[SourceView], SourcePoints]:
+def _joined(parts: list[tuple[list[SourceView], SourcePoints]]) -> tuple[list[SourceView], SourcePoints]:
     """Return the views and points of several models; of an image in two of them, the first counts."""
     views = {view.name: view for found, _ in reversed(parts) for view in found}
     columns = [points.columns() for _, points in parts]
@@ -158,7 +156,7 @@ def _joined(
     return list(views.values()), SourcePoints(**joined, path=first.path, colors_from=first.colors_from)
 
 
-def _with_photographs(root: Path, about: About, views: Sequence[SourceView]) -> About:
+def _with_photographs(about: About, views: Sequence[SourceView]) -> About:
     """Add the number of photographs that have no camera, and say it.
 
     They are searched in the folders of those that have one, so that folders of masks or of smaller copies do
