@@ -31,8 +31,8 @@ from blitzgs.capture.layouts import About, read_layout
 from blitzgs.capture.lengths import blind_views, find_apart, measured_extent, near_plane, nearest_depths
 from blitzgs.capture.masks import FindDamage, check_mask_sizes, check_masks, damaged, find_masks
 from blitzgs.capture.names import MissingImagesError as MissingImagesError
-from blitzgs.capture.names import check_inside, existing, relative_to, to_convert
-from blitzgs.capture.projects.find import FoundProject, folder_of, project_at
+from blitzgs.capture.names import check_inside, existing, relative_to
+from blitzgs.capture.projects.find import named_project
 from blitzgs.capture.splits import split_views, without_unused
 from blitzgs.capture.usable import (
     check_lenses,
@@ -128,7 +128,7 @@ def load_capture(
         FileNotFoundError: the folder has no capture, or images are missing on disk (`MissingImagesError`).
         ValueError: a file is damaged, or sizes, poses or options are invalid.
     """
-    root, project = _root_of(Path(path), images)
+    root, project = named_project(Path(path), images) if Path(path).is_file() else (Path(path), None)
     _check_options(downscale, exif, undistort, stray_cameras)
     views, points, about = read_layout(root, images, downscale, sparse, project)
     if not views:
@@ -225,19 +225,6 @@ def _headers(views: list[SourceView]) -> list[ImageHeader]:
             f"call alpha (first: {extra_bands[0]}), near infrared for example; it is not used"
         )
     return headers
-
-
-def _root_of(path: Path, images: str) -> tuple[Path, FoundProject | None]:
-    """Return the folder of a capture, and the project that was named instead of it."""
-    if not path.is_file():
-        return path, None
-    project = project_at(path)
-    if project is None:
-        raise FileNotFoundError(
-            f"{path} is no project that can be read (docs/captures.md lists them): name the folder of the "
-            f"capture (images and a COLMAP model) with --data{to_convert([path.name])}"
-        )
-    return folder_of(path, images), project
 
 
 def _with_masks(

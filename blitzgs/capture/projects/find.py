@@ -11,7 +11,15 @@ from typing import NamedTuple
 from blitzgs.capture.cameras import SourceView
 from blitzgs.capture.image_files import read_header
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.names import IMAGE_SUFFIXES, any_case, by_parts, files_below, find_images, unified
+from blitzgs.capture.names import (
+    IMAGE_SUFFIXES,
+    any_case,
+    by_parts,
+    files_below,
+    find_images,
+    to_convert,
+    unified,
+)
 from blitzgs.capture.points import SUFFIXES, SourcePoints, file_points
 from blitzgs.capture.projects import Project
 from blitzgs.capture.projects.metashape import is_metashape, read_metashape
@@ -49,12 +57,20 @@ _KINDS: tuple[tuple[str, tuple[str, ...], Callable[[Path], Project], Callable[[P
 _FOLDERS_ABOVE = 3
 
 
-def project_at(path: Path) -> FoundProject | None:
-    """Return the project of a file; None: it is none."""
+def named_project(path: Path, images: str) -> tuple[Path, FoundProject]:
+    """Return the folder of the capture that the file of a project describes, and the project.
+
+    It is the nearest folder that has the images' folder. FileNotFoundError: the file is no project.
+    """
     for program, patterns, read, is_one in _KINDS:
         if any(PurePosixPath(path.name).match(Path(p).name) for p in patterns) and is_one(path):
-            return FoundProject(program, _original(path), read)
-    return None
+            above = [path.parent, *path.parent.parents][:_FOLDERS_ABOVE]
+            root = next((folder for folder in above if (folder / images).is_dir()), path.parent)
+            return root, FoundProject(program, _original(path), read)
+    raise FileNotFoundError(
+        f"{path} is no project that can be read (docs/captures.md lists them): name the folder of the "
+        f"capture (images and a COLMAP model) with --data{to_convert([path.name])}"
+    )
 
 
 def _original(path: Path) -> Path:
@@ -80,12 +96,6 @@ def find_project(root: Path) -> FoundProject | None:
         shown = ", ".join(str(project.file.relative_to(root)) for project in main[:5])
         raise ValueError(f"{root} has {len(main)} projects ({shown}): name one of these files with --data")
     return main[0] if main else None
-
-
-def folder_of(file: Path, images: str) -> Path:
-    """Return the folder of the capture of a project's file: the nearest one that has the images' folder."""
-    above = [file.parent, *file.parent.parents][:_FOLDERS_ABOVE]
-    return next((folder for folder in above if (folder / images).is_dir()), file.parent)
 
 
 def read_project(
