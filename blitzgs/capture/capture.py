@@ -34,13 +34,7 @@ from blitzgs.capture.names import MissingImagesError as MissingImagesError
 from blitzgs.capture.names import check_inside, existing, relative_to
 from blitzgs.capture.projects.find import named_project
 from blitzgs.capture.splits import split_views, without_unused
-from blitzgs.capture.usable import (
-    check_lenses,
-    finite_points,
-    points_at_random,
-    with_finite_poses,
-    without_strays,
-)
+from blitzgs.capture.usable import finite_points, points_at_random, usable_views, without_strays
 from blitzgs.config.ranges import CHOICES
 from blitzgs.util.errors import check_number, located, warn
 
@@ -136,8 +130,7 @@ def load_capture(
     listed = len(views)
     views = without_unused(views, split)
     unused = listed - len(views)
-    check_lenses(views)
-    views = sorted(with_finite_poses(views), key=lambda view: view.name)
+    views = usable_views(views)
     points = finite_points(points)
     # Use all views, so that a photograph that is lost later changes neither the origin nor the split.
     train, test, why = split_views(views, root, split)

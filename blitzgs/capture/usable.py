@@ -28,8 +28,12 @@ def _is_usable(coordinates: Float64) -> npt.NDArray[np.bool_]:
     return np.asarray(np.abs(coordinates) < _FARTHEST)  # false for NaN
 
 
-def with_finite_poses(views: list[SourceView]) -> list[SourceView]:
-    """Return the views whose pose is finite; warn of the others (ValueError: there is none)."""
+def usable_views(views: list[SourceView]) -> list[SourceView]:
+    """Return the views whose pose is finite, by name; warn of the others, and of lenses that are unusual.
+
+    ValueError: no pose is finite, or no camera has one of the lenses.
+    """
+    _check_lenses(views)
     finite = [view for view in views if _is_usable(view.world_to_camera).all()]
     if not finite:
         raise ValueError(f"none of the {len(views)} views has a pose (a finite rotation and translation)")
@@ -39,11 +43,10 @@ def with_finite_poses(views: list[SourceView]) -> list[SourceView]:
             f"{len(views) - len(finite)} of {len(views)} views have no finite pose and were dropped "
             f"(first: {first})"
         )
-    return finite
+    return sorted(finite, key=lambda view: view.name)
 
 
-def check_lenses(views: list[SourceView]) -> None:
-    """Refuse lenses that no camera has, and name those that are unusual."""
+def _check_lenses(views: list[SourceView]) -> None:
     first: dict[Lens, str] = {}
     for view in views:
         first.setdefault(view.lens, view.name)
@@ -82,7 +85,10 @@ def finite_points(points: SourcePoints) -> SourcePoints:
 
 
 def points_at_random(root: Path, cameras: Sequence[Camera], offset: Float64) -> SourcePoints:
-    """Return uniform points of random colours in the region that the cameras look at (ValueError: none)."""
+    """Return uniform points of random colours in the region that the cameras look at.
+
+    ValueError: all cameras are in one place.
+    """
     warn(
         f"{root}: the capture has no points; {_RANDOM_POINTS:,} random ones take their place. Points of the "
         "reconstruction give a better start"
@@ -122,9 +128,7 @@ def read_cameras(path: Path, offset: Float64) -> list[Camera]:
         raise FileNotFoundError(f"{path}: there is no such transforms file or folder of a COLMAP model")
     if not views:
         raise ValueError(f"{path} has no cameras")
-    check_lenses(views)
-    views = sorted(with_finite_poses(views), key=lambda view: view.name)
-    return [_pinhole(view, offset) for view in views]
+    return [_pinhole(view, offset) for view in usable_views(views)]
 
 
 def _pinhole(view: SourceView, offset: Float64) -> Camera:
