@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 import cv2
 import numpy as np
 
-from blitzgs.capture.colmap import Float64, find_incomplete_model
+from blitzgs.capture.colmap import Float64, find_incomplete_model, find_models
 from blitzgs.capture.image_files import decode_mask, in_threads, read_header, read_whole
 from blitzgs.capture.masks import damaged, find_masks
 from blitzgs.capture.names import BY_PRODUCTS, IMAGE_SUFFIXES, files_below, to_convert
@@ -47,7 +47,9 @@ def has_photographs_alone(root: Path, images: str) -> bool:
     """
     if not root.is_dir() or find_incomplete_model(root) or find_transforms(root):
         return False
-    if any(any(root.rglob(f"cameras{suffix}")) for suffix in (".bin", ".txt")) or find_project(root):
+    # Models anywhere below; behind links only where a capture has them.
+    models = any(any(root.rglob(f"cameras{suffix}")) for suffix in (".bin", ".txt"))
+    if models or any(find_models(root / part) for part in ("", "train", "val")) or find_project(root):
         return False
     return bool(_photographs_of(files_below(photograph_folder(root, images))))
 
