@@ -9,7 +9,9 @@ axis) and marks the rest.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +80,7 @@ class Rectification:
         return (np.asarray(columns) + 0.5 + self.x0 - cx) / fx, (np.asarray(rows) + 0.5 + self.y0 - cy) / fy
 
 
+@cache
 def rectify(lens: Lens, policy: str = "crop") -> Rectification:
     """Choose the pinhole image for a lens; `policy` is "crop" or "mask".
 
@@ -140,13 +143,13 @@ def _seen(
         return seen
     distances = np.where(seen, u[None, :] ** 2 + v[:, None] ** 2, np.inf)
     row, column = np.unravel_index(distances.argmin(), seen.shape)
-    if _is_folded(lens, float(u[column]), float(v[row])):
+    if is_folded(lens, float(u[column]), float(v[row])):
         raise ValueError(_UNSEEN.format(lens))
     _, labels = cv2.connectedComponents(seen.astype(np.uint8), connectivity=4)
     return np.asarray(labels == labels[row, column])
 
 
-def _is_folded(lens: Lens, u: float, v: float) -> bool:
+def is_folded(lens: Lens, u: float, v: float) -> bool:
     """Tell whether the lens mirrors the image or sees nothing somewhere between its axis and a direction."""
     share, step = np.linspace(0, 1, _GRID), 1e-5
     right, left = (lens.project(share * u + d, share * v) for d in (step, -step))
@@ -230,6 +233,12 @@ class SourceView:
     # two that exclude each other; None if they do not say.
     part: str | None = None
 
+    def pose_from(self, origin: Float64) -> Float64:
+        """Return the pose [4, 4] in the world whose origin was moved to `origin` [3]."""
+        pose = self.world_to_camera.copy()
+        pose[:3, 3] += pose[:3, :3] @ origin
+        return pose
+
     def pixels_of(self, points: Float64) -> Float64:
         """Return the pixels [S, 2] at which the view shows points [M, 3], occluded ones too; others not."""
         x, y, depth = self.world_to_camera[:3, :3] @ points.T + self.world_to_camera[:3, 3:]
@@ -238,6 +247,14 @@ class SourceView:
             pixels = np.stack(self.lens.project(x[front] / depth[front], y[front] / depth[front]), axis=1)
             inside = (pixels >= 0) & (pixels < [self.lens.width, self.lens.height])
         return np.asarray(pixels[inside.all(axis=1)])
+
+
+def pose_of(camera_to_world: Float64, centre: Float64 | Sequence[float]) -> Float64:
+    """Return world to camera [4, 4] of a camera's axes in the world (columns of [3, 3]) and its centre."""
+    pose = np.eye(4)
+    pose[:3, :3] = camera_to_world.T
+    pose[:3, 3] = -camera_to_world.T @ np.asarray(centre)
+    return pose
 
 
 def camera_centres(world_to_camera: Float64) -> Float64:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,7 +19,6 @@ from blitzgs.capture.cameras import (
     MAX_SIDE,
     Camera,
     Float64,
-    Rectification,
     SourceView,
     camera_centres,
     downscaled_size,
@@ -28,29 +26,20 @@ from blitzgs.capture.cameras import (
     same_shape,
     scaled_matrix,
 )
-from blitzgs.capture.image_files import ImageHeader, read_header
+from blitzgs.capture.image_files import ImageHeader, in_threads, read_header
 from blitzgs.capture.layouts import About, read_layout
 from blitzgs.capture.lengths import blind_views, find_apart, measured_extent, near_plane, nearest_depths
-from blitzgs.capture.lens import Lens
 from blitzgs.capture.masks import FindDamage, check_mask_sizes, check_masks, damaged, find_masks
 from blitzgs.capture.names import MissingImagesError as MissingImagesError
-from blitzgs.capture.names import check_inside, existing, relative_to, to_convert
-from blitzgs.capture.projects.find import FoundProject, folder_of, project_at
-from blitzgs.capture.usable import (
-    check_lenses,
-    finite_points,
-    points_at_random,
-    split_capture,
-    with_finite_poses,
-    without_strays,
-    without_unused,
-)
+from blitzgs.capture.names import check_inside, existing, relative_to
+from blitzgs.capture.projects.find import named_project
+from blitzgs.capture.splits import split_views, without_unused
+from blitzgs.capture.usable import finite_points, points_at_random, usable_views, without_strays
 from blitzgs.config.ranges import CHOICES
 from blitzgs.util.errors import check_number, located, warn
 
 # In pixels. SSIM compares windows of 11 pixels, and a much smaller image shows too little to train on.
 _LEAST_SIDE = 8
-_HEADER_THREADS = 16
 
 
 @dataclass(eq=False)
@@ -110,7 +99,7 @@ def load_capture(
         downscale: reduce both sides of the camera model's size by this factor. A folder such as images_4 is
             used for 4 if it contains every image at the right size; otherwise images are downscaled by
             averaging areas when they are decoded.
-        split: see `usable.split_views`: n, "val", a list file, or "auto" (the split of the files, or every
+        split: see `splits.split_views`: n, "val", a list file, or "auto" (the split of the files, or every
             8th view).
         masks: folder of masks (NAME.png or STEM.png; black = excluded). None uses `masks/` when it exists;
             True requires it; False uses none.
@@ -133,7 +122,7 @@ def load_capture(
         FileNotFoundError: the folder has no capture, or images are missing on disk (`MissingImagesError`).
         ValueError: a file is damaged, or sizes, poses or options are invalid.
     """
-    root, project = _root_of(Path(path), images)
+    root, project = named_project(Path(path), images) if Path(path).is_file() else (Path(path), None)
     _check_options(downscale, exif, undistort, stray_cameras)
     views, points, about = read_layout(root, images, downscale, sparse, project)
     if not views:
@@ -141,11 +130,10 @@ def load_capture(
     listed = len(views)
     views = without_unused(views, split)
     unused = listed - len(views)
-    check_lenses(views)
-    views = sorted(with_finite_poses(views), key=lambda view: view.name)
+    views = usable_views(views)
     points = finite_points(points)
     # Use all views, so that a photograph that is lost later changes neither the origin nor the split.
-    train, test, why = split_capture(views, root, split)
+    train, test, why = split_views(views, root, split)
     apart, strays = find_apart(views, points.positions)
     centres = camera_centres(np.stack([view.world_to_camera for view in views]))
     offset = centres[~apart].mean(axis=0)
@@ -164,9 +152,8 @@ def load_capture(
     if not train:
         raise MissingImagesError(f"{root}: no image of a training view is on disk and whole")
     headers = _headers(views)
-    plans: dict[Lens, Rectification] = {}
     cameras = [
-        _camera(view, header, offset, downscale, undistort, exif, plans)
+        _camera(view, header, offset, downscale, undistort, exif)
         for view, header in zip(views, headers, strict=True)
     ]
     check_mask_sizes(cameras)
@@ -222,8 +209,7 @@ def _check_options(downscale: float, exif: str, undistort: str, stray_cameras: s
 
 def _headers(views: list[SourceView]) -> list[ImageHeader]:
     """Read the headers of the photographs and check their masks; warn of bands that are not used."""
-    with ThreadPoolExecutor(_HEADER_THREADS) as pool:  # the files may be on a slow network disk
-        headers = list(pool.map(lambda view: read_header(view.path), views))
+    headers = in_threads(read_header, [view.path for view in views])
     check_masks([view.mask_path for view in views])
     extra_bands = [view.name for view, header in zip(views, headers, strict=True) if header.extra_bands]
     if extra_bands:
@@ -232,19 +218,6 @@ def _headers(views: list[SourceView]) -> list[ImageHeader]:
             f"call alpha (first: {extra_bands[0]}), near infrared for example; it is not used"
         )
     return headers
-
-
-def _root_of(path: Path, images: str) -> tuple[Path, FoundProject | None]:
-    """Return the folder of a capture, and the project that was named instead of it."""
-    if not path.is_file():
-        return path, None
-    project = project_at(path)
-    if project is None:
-        raise FileNotFoundError(
-            f"{path} is no project that can be read (docs/captures.md lists them): name the folder of the "
-            f"capture (images and a COLMAP model) with --data{to_convert([path.name])}"
-        )
-    return folder_of(path, images), project
 
 
 def _with_masks(
@@ -264,13 +237,7 @@ def _with_masks(
 
 
 def _camera(
-    view: SourceView,
-    header: ImageHeader,
-    offset: Float64,
-    downscale: float,
-    policy: str,
-    exif: str,
-    plans: dict[Lens, Rectification],
+    view: SourceView, header: ImageHeader, offset: Float64, downscale: float, policy: str, exif: str
 ) -> Camera:
     orientation = _orientation(view, header, exif)
     width, height = (header.height, header.width) if orientation >= 5 else (header.width, header.height)
@@ -285,11 +252,8 @@ def _camera(
             f"{view.path} is {width} x {height}: no side may be longer than {MAX_SIDE:,} pixels; put a "
             "smaller copy in its place"
         )
-    lens = view.lens.scaled(width, height)
-    if lens not in plans:
-        with located(f"the camera of {view.path}"):
-            plans[lens] = rectify(lens, policy)
-    plan = plans[lens]
+    with located(f"the camera of {view.path}"):
+        plan = rectify(view.lens.scaled(width, height), policy)
     # Images from images_N are downscaled already; only the rest of the factor is applied while decoding.
     already = max(1.0, view.lens.width / width) if downscale > 1 else 1.0
     left = downscale / already if downscale / already > 1.01 else 1.0
@@ -299,14 +263,12 @@ def _camera(
             f"downscale {downscale} leaves {size[0]} x {size[1]} pixels of {view.path}, which is {width} x "
             f"{height}: choose a smaller one"
         )
-    pose = view.world_to_camera.copy()
-    pose[:3, 3] += pose[:3, :3] @ offset
     return Camera(
         name=view.name,
         width=size[0],
         height=size[1],
         K=scaled_matrix(plan.K, (plan.width, plan.height), size),
-        world_to_camera=pose,
+        world_to_camera=view.pose_from(offset),
         image_path=view.path,
         mask_path=view.mask_path,
         orientation=orientation,

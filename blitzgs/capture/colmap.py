@@ -113,9 +113,9 @@ def find_models(path: Path) -> list[tuple[Path, int]]:
 
 def find_incomplete_model(path: Path) -> Path | None:
     """Return the folder of a model that lacks files, where `find_models` would look for it, or None."""
-    folders = ("sparse/0", "sparse", ".", "colmap/sparse/0", "colmap/sparse")
-    kinds = [(name, suffix) for name in FILES for suffix in _SUFFIXES]
-    return next((path / f for f in folders if any(_file(path / f, *kind).is_file() for kind in kinds)), None)
+    folders = [path / name for name in ("sparse/0", "sparse", ".", "colmap/sparse/0", "colmap/sparse")]
+    kinds = ((folder, _files(folder, suffix)) for folder in folders for suffix in _SUFFIXES)
+    return next((folder for folder, files in kinds if any(map(Path.is_file, files.values()))), None)
 
 
 def _numbered(folder: Path) -> list[Path]:
@@ -126,17 +126,16 @@ def _numbered(folder: Path) -> list[Path]:
 
 def complete_files(folder: Path) -> dict[str, Path] | None:
     """Return the files of a model by their names in `FILES`, binary ones first; None: one is missing."""
-    kinds = ({name: _file(folder, name, suffix) for name in FILES} for suffix in _SUFFIXES)
-    return next((files for files in kinds if all(path.is_file() for path in files.values())), None)
+    kinds = (_files(folder, suffix) for suffix in _SUFFIXES)
+    return next((files for files in kinds if all(map(Path.is_file, files.values()))), None)
 
 
-def _file(folder: Path, name: str, suffix: str) -> Path:
-    """Return a file of a model; its points may be in points3D.ply alone, or in a file of another program."""
-    path = folder / (name + suffix)
-    others = [folder / (name + other) for other in _SUFFIXES]
-    if name == "points3D" and not any(other.is_file() for other in others):
-        path = next((p for s in POINT_SUFFIXES if (p := path.with_suffix(s)).is_file()), path)
-    return path
+def _files(folder: Path, suffix: str) -> dict[str, Path]:
+    """Return the files of a model by their names; its points may be in a file of another program alone."""
+    files = {name: folder / f"{name}{suffix}" for name in FILES}
+    points = [folder / f"points3D{other}" for other in (*_SUFFIXES, *POINT_SUFFIXES)]
+    found = next((path for path in points if path.is_file()), None)
+    return files if found is None or found.suffix in _SUFFIXES else {**files, "points3D": found}
 
 
 def count_images(folder: Path) -> int:
@@ -159,7 +158,7 @@ def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = Fal
     paths = complete_files(folder)
     if paths is None:
         suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
-        lost = next(path for name in FILES if not (path := _file(folder, name, suffix)).is_file())
+        lost = next(path for path in _files(folder, suffix).values() if not path.is_file())
         raise FileNotFoundError(f"{lost} is missing: {folder} is not a complete COLMAP sparse model")
     cameras = [ColmapCamera(*row) for row in native.read_cameras(os.fsencode(paths["cameras"]))]
     images, points = native.read_images(os.fsencode(paths["images"]), points2d), ColmapPoints()

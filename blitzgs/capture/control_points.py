@@ -8,18 +8,21 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
-from blitzgs.capture.cameras import Camera, Float64, camera_centres
+from blitzgs.capture.cameras import Camera, Float64, camera_centres, is_folded
+from blitzgs.capture.fields import number, read_small
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.names import unified
-from blitzgs.capture.world import WorldFrame, fit_similarity, read_small, utm_of_text
+from blitzgs.capture.names import any_case, by_parts
+from blitzgs.capture.world import WorldFrame, fit_similarity, utm_of_text
+from blitzgs.util.errors import located
 
 # The least angle between two rays to a point, in degrees: below it, its distance is unknown.
 _LEAST_ANGLE = 1.0
 _COLUMNS = ("name", "e", "n", "h", "image", "x", "y")
+_NUMBERS = ("e", "n", "h", "x", "y")
 _SAME = {"east": "e", "easting": "e", "north": "n", "northing": "n", "height": "h", "up": "h", "z": "h",
          "alt": "h", "gcp": "name", "label": "name", "photo": "image", "px": "x", "py": "y"}  # fmt: skip
 # Of so many triples of points the best is searched.
@@ -62,17 +65,16 @@ def read_control_points(path: Path) -> tuple[list[ControlPoint], str]:
         return _gcp_list(path, lines)
     points: dict[str, ControlPoint] = {}
     begin = lines.index(head) + 1
-    for number, row in enumerate(csv.reader(lines[begin:], delimiter=separator or ","), start=begin + 1):
+    for place, row in enumerate(csv.reader(lines[begin:], delimiter=separator or ","), start=begin + 1):
         if not any(cell.strip() for cell in row):
             continue
-        where = f"{path}: line {number}"
-        if len(row) < len(columns):
-            raise ValueError(f"{where}: {len(row)} values in {len(columns)} columns")
-        cells = dict(zip(columns, (cell.strip() for cell in row), strict=False))
-        numbers = [cells[key] for key in ("e", "n", "h", "x", "y")]
-        if separator == ";":  # where a comma is the decimal mark
-            numbers = [number.replace(",", ".") for number in numbers]
-        _add(points, cells["name"], cells["image"], numbers, where)
+        with located(f"{path}: line {place}"):
+            if len(row) < len(columns):
+                raise ValueError(f"{len(row)} values in {len(columns)} columns")
+            cells = dict(zip(columns, (cell.strip() for cell in row), strict=False))
+            if separator == ";":  # where a comma is the decimal mark
+                cells |= {key: cells[key].replace(",", ".") for key in _NUMBERS}
+            _add(points, cells)
     return list(points.values()), ""
 
 
@@ -80,29 +82,28 @@ def _gcp_list(path: Path, lines: Sequence[str]) -> tuple[list[ControlPoint], str
     """Read OpenDroneMap's list: the reference system, then `E N h x y image [name]`."""
     crs = lines[0].strip() if lines else ""
     points: dict[str, ControlPoint] = {}
-    for number, line in enumerate(lines[1:], start=2):
+    for place, line in enumerate(lines[1:], start=2):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
-        where = f"{path}: line {number}"
-        if len(words) < 6:
-            raise ValueError(f"{where}: expected E, N, h, x, y and an image, got {line!r:.60}")
-        _add(points, words[6] if len(words) > 6 else " ".join(words[:3]), words[5], words[:5], where)
+        with located(f"{path}: line {place}"):
+            if len(words) < 6:
+                raise ValueError(f"expected E, N, h, x, y and an image, got {line!r:.60}")
+            words += [" ".join(words[:3])]  # of a point without a name
+            _add(points, dict(zip((*_NUMBERS, "image", "name"), words, strict=False)))
     if not points:
         raise ValueError(f"{path}: no points: expected the columns {','.join(_COLUMNS)}, or a gcp_list.txt")
     return list(points.values()), utm_of_text(crs) or crs
 
 
-def _add(points: dict[str, ControlPoint], name: str, image: str, words: Sequence[str], where: str) -> None:
-    try:
-        e, n, h, x, y = (float(word) for word in words)
-    except ValueError as error:
-        raise ValueError(f"{where}: expected numbers ({error})") from error
-    if not np.isfinite([e, n, h, x, y]).all() or not name or not image:
-        raise ValueError(f"{where}: a name, an image or a finite number is missing")
+def _add(points: dict[str, ControlPoint], cells: Mapping[str, str]) -> None:
+    e, n, h, x, y = (number(cells, key) for key in _NUMBERS)
+    name, image = cells["name"], cells["image"]
+    if not name or not image:
+        raise ValueError("a name or an image is missing")
     point = points.setdefault(name, ControlPoint(name, np.array([e, n, h])))
     if not np.array_equal(point.world, [e, n, h]):
-        raise ValueError(f"{where}: {name} has another place on a line above: correct one of them")
+        raise ValueError(f"{name} has another place on a line above: correct one of them")
     point.marks.append((image, x, y))
 
 
@@ -111,9 +112,11 @@ def place(points: Sequence[ControlPoint], cameras: Sequence[Camera], origin: Flo
 
     The cameras are those of a capture that was loaded without downscaling, `origin` is its `Capture.offset`.
     """
-    by_name, found = _by_name(cameras), []
+    known, found = by_parts(camera.name for camera in cameras), []
+    # The marks have names without folders; they count where one camera is called so.
+    by_name = {key: cameras[some[0]] for key, some in known.items() if len(some) == 1}
     for point in points:
-        marks = [(by_name.get(_key(image)), image, x, y) for image, x, y in point.marks]
+        marks = [(by_name.get(any_case(mark[0]).rpartition("/")[2]), *mark) for mark in point.marks]
         placed = replace(point, seen=[(camera, x, y) for camera, _, x, y in marks if camera is not None])
         found.append(placed)
         if len({camera.name for camera, _, _ in placed.seen}) < 2:
@@ -126,19 +129,6 @@ def place(points: Sequence[ControlPoint], cameras: Sequence[Camera], origin: Flo
         except ValueError as error:
             placed.problem = str(error)
     return found
-
-
-def _key(name: str) -> str:
-    return PurePosixPath(unified(name).casefold()).name
-
-
-def _by_name(cameras: Sequence[Camera]) -> Mapping[str, Camera]:
-    """Return the cameras by their names without folders, with and without suffix, where these are unique."""
-    named: dict[str, list[Camera]] = {}
-    for camera in cameras:
-        for key in {_key(camera.name), PurePosixPath(_key(camera.name)).stem}:
-            named.setdefault(key, []).append(camera)
-    return {key: some[0] for key, some in named.items() if len(some) == 1}
 
 
 def normalised(lens: Lens, x: float, y: float) -> Float64:
@@ -160,16 +150,9 @@ def normalised(lens: Lens, x: float, y: float) -> Float64:
         if not np.isfinite(jacobian).all() or abs(np.linalg.det(jacobian)) < 1e-9:
             break
         at = at - np.linalg.solve(jacobian, error)
-    if np.abs(error).max() < 1e-6 and _before_fold(lens, at):
+    if np.abs(error).max() < 1e-6 and not is_folded(lens, *at.tolist()):
         return at
     raise ValueError(f"the mark {x:g}, {y:g} is outside what its lens of {lens.width} x {lens.height} maps")
-
-
-def _before_fold(lens: Lens, at: Float64) -> bool:
-    """Tell whether the pixels move outwards all the way from the axis to a direction."""
-    shares = np.linspace(0, 1, 64)
-    path = np.stack(lens.project(shares * at[0], shares * at[1]), axis=1)
-    return bool((np.diff(path @ (at * lens.intrinsics[:2])) >= 0).all())
 
 
 def _intersect(cameras: Sequence[Camera], rays: Float64) -> Float64:

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -22,6 +23,8 @@ import numpy.typing as npt
 from blitzgs.formats import native
 
 UInt8 = npt.NDArray[np.uint8]
+T = TypeVar("T")
+R = TypeVar("R")
 
 _HEADER_BYTES = 1 << 16
 _TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -55,6 +58,12 @@ class ImageHeader:
     orientation: int = 1
     has_alpha: bool = False
     extra_bands: int = 0
+
+
+def in_threads(call: Callable[[T], R], files: Iterable[T]) -> list[R]:
+    """Return what a function returns for each of several files, which may be on a slow network disk."""
+    with ThreadPoolExecutor(16) as pool:
+        return list(pool.map(call, files))
 
 
 def read_header(path: Path) -> ImageHeader:
@@ -171,6 +180,12 @@ def _imdecode(file: ImageFile, flags: int) -> npt.NDArray[Any]:
         kind = header["format"]
         reader = f", or a {kind} that OpenCV {cv2.__version__} does not read" if kind else ""
         raise ValueError(f"{name}: cannot be decoded (damaged, truncated or not an image{reader})")
+    if flags == cv2.IMREAD_UNCHANGED and pixels.ndim == 2 and header["transparent_grey"] is not None:
+        # One grey value of a PNG is transparent, which OpenCV ignores.
+        full, bits, value = int(_full(pixels, header)), header["bits"], header["transparent_grey"]
+        stored = value * (full // ((1 << bits) - 1)) if bits < 8 else value
+        alpha = np.where(pixels == stored, 0, full).astype(pixels.dtype)
+        pixels = np.stack([pixels, pixels, pixels, alpha], axis=2)
     return np.asarray(pixels)
 
 
@@ -200,8 +215,6 @@ def decode_rgb(
     header = file.header
     if background is not None and header["alpha"]:
         pixels = _imdecode(file, cv2.IMREAD_UNCHANGED)
-        if (grey := header["transparent_grey"]) is not None and pixels.ndim == 2:
-            pixels = _with_transparent_grey(pixels, grey, header["bits"])
         if pixels.ndim == 3 and pixels.shape[2] == 4:
             return _over(pixels, background, _full(pixels, header), header["alpha"] == "associated")
     pixels = _imdecode(file, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -238,14 +251,6 @@ def _full(pixels: npt.NDArray[Any], header: dict[str, Any]) -> float:
     return float(np.iinfo(pixels.dtype).max)
 
 
-def _with_transparent_grey(grey: npt.NDArray[Any], value: int, bits: int) -> npt.NDArray[Any]:
-    """Return BGRA of a PNG in which one grey value is transparent; OpenCV ignores that value."""
-    full = np.iinfo(grey.dtype).max
-    stored = value * (full // ((1 << bits) - 1)) if bits < 8 else value
-    alpha = np.where(grey == stored, 0, full).astype(grey.dtype)
-    return np.stack([grey, grey, grey, alpha], axis=2)
-
-
 def _over(
     bgra: npt.NDArray[Any], background: tuple[float, float, float], full: float, associated: bool
 ) -> UInt8:
@@ -275,8 +280,6 @@ def decode_mask(file: ImageFile) -> UInt8:
     flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     pixels = _imdecode(file, cv2.IMREAD_UNCHANGED if header["alpha"] else flags)
     full = _full(pixels, header)
-    if (grey := header["transparent_grey"]) is not None and pixels.ndim == 2:
-        pixels = _with_transparent_grey(pixels, grey, header["bits"])
     if header["is_white_zero"] and pixels.dtype == np.uint16:  # which OpenCV turns round for 8 bits only
         pixels = np.asarray(np.iinfo(np.uint16).max - pixels)
     opaque = None

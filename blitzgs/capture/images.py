@@ -20,8 +20,9 @@ from collections import OrderedDict
 from collections.abc import Hashable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Generic, TypeAlias, TypeVar
 
 import cv2
 import numpy as np
@@ -42,14 +43,16 @@ from blitzgs.capture.image_files import (
     reduced,
     reduced_mask,
 )
-from blitzgs.capture.masks import FileCheck, mask_error, misfit
-from blitzgs.capture.shared_images import BoundedCache as BoundedCache
+from blitzgs.capture.masks import FileCheck, misfit
 from blitzgs.capture.shared_images import SharedImages
 from blitzgs.formats import native
+from blitzgs.util.errors import located
 from blitzgs.util.terminal import amount
 
+K = TypeVar("K")
+V = TypeVar("V")
 DEFAULT_BUDGET = 4 << 30
-_MAPS_KEPT = 4
+_MAPS_KEPT = 4  # because those of a 12-megapixel image take 100 MB
 # "image" or "mask", the camera, and the factor by which it is reduced.
 _Key: TypeAlias = tuple[str, int, int]
 # Columns and rows of `Rectification.maps`, and which pixels the lens has seen.
@@ -75,6 +78,50 @@ class ImageMemory:
             f"{amount(self.compressed_budget)}), {amount(self.decoded_bytes)} decoded (limit "
             f"{amount(self.decoded_budget)}); {self.decoded:,} decodings"
         )
+
+
+class BoundedCache(Generic[K, V]):
+    """A least-recently-used cache with a budget of bytes; an entry larger than the budget is not stored."""
+
+    def __init__(self, budget: int) -> None:
+        """Hold at most `budget` bytes."""
+        self.budget = budget  # the largest size, in bytes
+        self.bytes = 0  # the size now
+        self.most_bytes = 0  # the largest size so far
+        self._entries: OrderedDict[K, tuple[V, int]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: K) -> V | None:
+        """Return the entry and mark it as the most recently used; None if it is not stored."""
+        with self._lock:
+            if key not in self._entries:
+                return None
+            self._entries.move_to_end(key)
+            return self._entries[key][0]
+
+    def put(self, key: K, value: V, size: int, spare: bool = False) -> None:
+        """Add or replace an entry of `size` bytes, dropping the oldest until all fit.
+
+        A spare entry drops no other one, and is the first to be dropped.
+        """
+        with self._lock:
+            if key in self._entries:
+                self.bytes -= self._entries.pop(key)[1]
+            if size > self.budget or (spare and self.bytes + size > self.budget):
+                return
+            while self.bytes + size > self.budget:
+                self.bytes -= self._entries.popitem(last=False)[1][1]
+            self._entries[key] = (value, size)
+            self._entries.move_to_end(key, last=not spare)
+            self.bytes += size
+            self.most_bytes = max(self.most_bytes, self.bytes)
+
+    def resize(self, budget: int) -> None:
+        """Change the budget, dropping the oldest entries until the others fit."""
+        with self._lock:
+            self.budget = budget
+            while self.bytes > budget:
+                self.bytes -= self._entries.popitem(last=False)[1][1]
 
 
 class PhotographError(RuntimeError):
@@ -128,7 +175,7 @@ class ImageStore:
         self.compressed: BoundedCache[Path | int, Any] = BoundedCache(budget_bytes)
         self._decoded_bytes = decoded_bytes
         self.decoded: BoundedCache[_Key, UInt8] = BoundedCache(self._decoded_budget())
-        self._maps: OrderedDict[Rectification, _Maps] = OrderedDict()
+        self._maps = lru_cache(_MAPS_KEPT)(_maps)
         self._maps_lock = threading.Lock()
         self._pending: dict[_Key, Future[UInt8]] = {}
         self._pending_lock = threading.Lock()
@@ -195,12 +242,8 @@ class ImageStore:
         """
         test = set(self.capture.test)
         order = sorted(indices, key=lambda index: index not in test)
-        self._check = FileCheck(self.capture.cameras, order, self._has_counted, self._whole_jpegs)
+        self._check = FileCheck([self.capture.cameras[index] for index in order], self._whole_jpegs)
         return self._check
-
-    def _has_counted(self, camera: Camera) -> bool:
-        assert camera.mask_path is not None
-        return bool(self._file_mask(camera, camera.mask_path).any())
 
     def close(self) -> None:
         """Stop the threads; images whose decoding has not begun are not decoded."""
@@ -336,10 +379,8 @@ class ImageStore:
 
     def _file_mask(self, camera: Camera, path: Path) -> UInt8:
         lens = camera.rectification.lens
-        try:
+        with located("the mask"):
             mask = decode_mask(self._read(path))
-        except ValueError as error:
-            raise mask_error(error) from error
         stored = (lens.width, lens.height) if camera.orientation < 5 else (lens.height, lens.width)
         if (mask.shape[1], mask.shape[0]) == stored:
             mask = apply_orientation(mask, camera.orientation)
@@ -361,15 +402,13 @@ class ImageStore:
         return pixels
 
     def _maps_of(self, plan: Rectification) -> _Maps:
-        """Return a camera's maps. Only a few are kept, because those of a 12-megapixel image take 100 MB."""
-        with self._maps_lock:
-            if plan not in self._maps:
-                columns, rows, seen = plan.maps()
-                self._maps[plan] = columns, rows, seen.astype(np.uint8)
-                if len(self._maps) > _MAPS_KEPT:
-                    self._maps.popitem(last=False)
-            self._maps.move_to_end(plan)
-            return self._maps[plan]
+        with self._maps_lock:  # so that two threads do not make the same ones, which takes seconds
+            return self._maps(plan)
+
+
+def _maps(plan: Rectification) -> _Maps:
+    columns, rows, seen = plan.maps()
+    return columns, rows, seen.astype(np.uint8)
 
 
 def _uint8(pixels: npt.ArrayLike) -> UInt8:

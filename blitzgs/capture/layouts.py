@@ -8,7 +8,7 @@ import shlex
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,15 +17,14 @@ from blitzgs.capture import colmap, transforms
 from blitzgs.capture.cameras import SourceView
 from blitzgs.capture.lengths import StrayCamera
 from blitzgs.capture.lens import lenses_of
-from blitzgs.capture.names import find_images, relative_to, to_convert
-from blitzgs.capture.points import SourcePoints, file_points, transforms_points
+from blitzgs.capture.names import BY_PRODUCTS, IMAGE_SUFFIXES, find_images, relative_to, to_convert
+from blitzgs.capture.points import SourcePoints, model_points, transforms_points
 from blitzgs.capture.projects.find import FoundProject, find_project, read_project
 from blitzgs.capture.world import WorldFrame, frame_beside
 from blitzgs.util.errors import located, warn
 
-_PHOTOGRAPH_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 # What programs write beside the images of a synthetic capture.
-_BY_PRODUCT = re.compile(r"(?i)(depth|normal|disp|mask|alpha|segmentation)s?(_?\d+)?$")
+_BY_PRODUCT = re.compile(rf"(?i)({BY_PRODUCTS})s?(_?\d+)?$")
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ def read_layout(
         )
     if project is not None:
         views, points, about = _read_project(root, project, images, downscale)
-        return views, points, _with_photographs(root, about, views)
+        return views, points, _with_photographs(about, views)
     models, notes = _models(root, sparse)
     folder = models[0] if models else None
     parts = {part: found[0][0] for part in ("train", "val") if (found := colmap.find_models(root / part))}
@@ -75,7 +74,7 @@ def read_layout(
         views, points, about = _read_transforms(root, folder)
     elif folder is not None:
         read = [_read_colmap(root, model, images, downscale) for model in models]
-        views, points = read[0] if len(read) == 1 else _joined(root, read)
+        views, points = read[0] if len(read) == 1 else _joined(read)
         shown = " and ".join(str(model.relative_to(root)) for model in models if model != root)
         about = About(shown or "cameras, images and points3D", "", tuple(notes))
     elif "train" in parts:
@@ -94,7 +93,7 @@ def read_layout(
         )
     if about.frame is None:
         about = replace(about, frame=frame_beside(root))
-    return views, points, _with_photographs(root, about, views)
+    return views, points, _with_photographs(about, views)
 
 
 def _read_project(
@@ -115,7 +114,7 @@ def _hint(root: Path) -> str:
             f"move the model to {root / 'sparse' / '0'}"
         )
     names = [path.name for path in (*root.glob("*"), *root.glob("*/*"))]
-    if any(PurePath(name).suffix.lower() in _PHOTOGRAPH_SUFFIXES for name in names):
+    if any(name.lower().endswith(IMAGE_SUFFIXES) for name in names):
         return (
             f"; it has images but not their cameras: blitzgs sfm {shlex.quote(str(root))} CAPTURE finds these"
         )
@@ -147,9 +146,7 @@ def _models(root: Path, sparse: str) -> tuple[list[Path], list[str]]:
     return [models[0][0]], [note]
 
 
-def _joined(
-    root: Path, parts: list[tuple[list[SourceView], SourcePoints]]
-) -> tuple[list[SourceView], SourcePoints]:
+def _joined(parts: list[tuple[list[SourceView], SourcePoints]]) -> tuple[list[SourceView], SourcePoints]:
     """Return the views and points of several models; of an image in two of them, the first counts."""
     views = {view.name: view for found, _ in reversed(parts) for view in found}
     columns = [points.columns() for _, points in parts]
@@ -159,14 +156,14 @@ def _joined(
     return list(views.values()), SourcePoints(**joined, path=first.path, colors_from=first.colors_from)
 
 
-def _with_photographs(root: Path, about: About, views: Sequence[SourceView]) -> About:
+def _with_photographs(about: About, views: Sequence[SourceView]) -> About:
     """Add the number of photographs that have no camera, and say it.
 
     They are searched in the folders of those that have one, so that folders of masks or of smaller copies do
     not count; only files with the suffixes of photographs in use count, and no depths or normals beside them.
     """
     used = {view.path for view in views}
-    suffixes = {path.suffix.lower() for path in used} & set(_PHOTOGRAPH_SUFFIXES)
+    suffixes = {path.suffix.lower() for path in used} & set(IMAGE_SUFFIXES)
     folders = {path.parent for path in used}
     known = used | {view.mask_path for view in views}
     without = sorted(
@@ -196,7 +193,9 @@ def _read_transforms(root: Path, model: Path | None) -> tuple[list[SourceView], 
     for note in notes:
         if not note.startswith("fields without effect"):
             warn(f"{content.files[0]}: {note}")
-    about = About(" and ".join(path.name for path in content.files), content.split, tuple(notes))
+    about = About(
+        " and ".join(path.name for path in content.files), " and ".join(content.split), tuple(notes)
+    )
     return content.frames, transforms_points(root, content, model), about
 
 
@@ -222,6 +221,4 @@ def _read_colmap(
         SourceView(f"{part}/{name}" if part else name, path, None, lens, pose)
         for name, path, lens, pose in zip(names, paths, lens_of, poses, strict=True)
     ]
-    if model.points_path is not None and model.points_path.suffix in colmap.POINT_SUFFIXES:
-        return views, file_points(model.points_path)
-    return views, SourcePoints.of_model(model.points, model.points_path, "the model's own colours")
+    return views, model_points(model)

@@ -18,7 +18,7 @@ from blitzgs.util.errors import warn
 
 # Cameras whose distance is below this share of the points' distance count as being in one place: the parallax
 # between them is far below a pixel.
-_LEAST_SPREAD = 1e-6
+LEAST_SPREAD = 1e-6
 # A camera is apart from the others if it is so many times farther from their middle than the farthest of
 # them, and than the points are. Without points, nothing tells an overview from a pose that is wrong.
 _GAP, _GAP_WITHOUT_POINTS = 5.0, 20.0
@@ -159,35 +159,8 @@ def measured_extent(centres: Float64, points: Float64) -> float:
     """Return a scene's extent (`Capture.extent`) by its training cameras [V, 3] and points [M, 3]."""
     extent = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     distance = float(np.median(np.linalg.norm(sampled(points, len(centres)) - centres[0], axis=1)))
-    if extent > _LEAST_SPREAD * distance:
+    if extent > LEAST_SPREAD * distance:
         return extent
     extent = distance
     warn(f"all training cameras are in one place: extent is the points' median distance, {extent:g}")
     return extent or 1.0
-
-
-def random_points(
-    cameras: Sequence[Camera], offset: Float64, count: int
-) -> tuple[Float64, npt.NDArray[np.uint8]]:
-    """Return uniform points of random colours in the region that cameras look at, in the capture's world.
-
-    ValueError: all cameras are in one place.
-    """
-    poses = np.stack([camera.world_to_camera for camera in cameras])
-    centres, axes = camera_centres(poses), poses[:, 2, :3]
-    # The point nearest to all optical axes by least squares; the tiny term keeps parallel axes solvable.
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    target = np.linalg.solve(
-        across.sum(axis=0) + 1e-6 * np.eye(3),
-        np.einsum("nij,nj->i", across, centres) + 1e-6 * centres.mean(axis=0),
-    )
-    half = 0.35 * float(np.linalg.norm(centres - target, axis=1).mean())
-    # Files state coordinates of a map, with offsets of millions of metres, to a millimetre.
-    if half <= _LEAST_SPREAD * (1 + 1e-3 * float(np.abs(offset).max())):
-        raise ValueError(
-            "the capture has no points and all its cameras are in one place, so the position of the "
-            "scene is unknown: add points to the capture"
-        )
-    random = np.random.default_rng(0)
-    positions = target + offset + random.uniform(-half, half, (count, 3))
-    return np.asarray(positions), random.integers(0, 256, (count, 3), dtype=np.uint8)

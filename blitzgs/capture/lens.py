@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
@@ -20,8 +21,14 @@ from blitzgs.capture.colmap import ColmapCamera, camera_models
 from blitzgs.util.errors import located
 
 Array = npt.NDArray[np.float64]
-_OWN_MODELS = {"BROWN": ["fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "skew"]}
 _Distort = Callable[[Array, Array, Sequence[float]], tuple[Array, Array]]
+
+
+@cache
+def lens_models() -> dict[str, list[str]]:
+    """Return the names of the parameters, in order, of every camera model."""
+    brown = ["fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "skew"]
+    return camera_models() | {"BROWN": brown}
 
 
 @dataclass(frozen=True)
@@ -34,10 +41,9 @@ class Lens:
     params: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        known = camera_models() | _OWN_MODELS
-        names = known.get(self.model)
+        names = lens_models().get(self.model)
         if names is None:
-            raise ValueError(f"unknown camera model {self.model!r}; known: {', '.join(known)}")
+            raise ValueError(f"unknown camera model {self.model!r}; known: {', '.join(lens_models())}")
         if self.model == "EQUIRECTANGULAR":
             raise ValueError(
                 "EQUIRECTANGULAR images show all directions and cannot be made into one perspective image; "
@@ -51,29 +57,20 @@ class Lens:
             )
 
     @property
-    def _shared_focal(self) -> bool:
-        return (_OWN_MODELS.get(self.model) or camera_models()[self.model])[0] == "f"
-
-    @property
     def intrinsics(self) -> tuple[float, float, float, float]:
         """Return fx, fy, cx, cy in pixels."""
-        if self._shared_focal:
-            f, cx, cy = self.params[:3]
-            return f, f, cx, cy
-        fx, fy, cx, cy = self.params[:4]
+        fx, fy, cx, cy = (self.params[0], *self.params[:3]) if self.model in _TWO_FOCALS else self.params[:4]
         return fx, fy, cx, cy
 
     @property
     def distortion(self) -> tuple[float, ...]:
         """Return the parameters after the intrinsics."""
-        return self.params[3 if self._shared_focal else 4 :]
+        return self.params[3 if self.model in _TWO_FOCALS else 4 :]
 
     @property
     def is_pinhole(self) -> bool:
         """Whether straight lines stay straight: the model is a pinhole, or its distortion is zero."""
-        if self.model in ("SIMPLE_PINHOLE", "PINHOLE"):
-            return True
-        return self.model in _ZERO_IS_PINHOLE and not any(self.distortion)
+        return _DISTORT[self.model] in _STRAIGHT_AT_ZERO and not any(self.distortion)
 
     @property
     def matrix(self) -> Array:
@@ -87,16 +84,13 @@ class Lens:
             return self
         sx, sy = width / self.width, height / self.height
         fx, fy, cx, cy = self.intrinsics
-        intrinsics = (fx * sx, fy * sy, cx * sx, cy * sy)
-        # Coefficients that the model with two focal lengths has in addition.
-        padding = {"SIMPLE_RADIAL": 3, "RADIAL": 2, "SIMPLE_RADIAL_FISHEYE": 3, "RADIAL_FISHEYE": 2}
-        params = (*intrinsics, *self.distortion, *[0.0] * padding.get(self.model, 0))
-        return Lens(_WITH_TWO_FOCALS.get(self.model, self.model), width, height, params)
+        model = _TWO_FOCALS.get(self.model, self.model)
+        params = (fx * sx, fy * sy, cx * sx, cy * sy, *self.distortion)
+        missing = len(lens_models()[model]) - len(params)
+        return Lens(model, width, height, (*params, *[0.0] * missing))
 
     def distort(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Map normalised coordinates to distorted ones; NaN if the model does not see the direction."""
-        if self.model in ("SIMPLE_PINHOLE", "PINHOLE"):
-            return u, v
         with np.errstate(all="ignore"):
             return _DISTORT[self.model](u, v, self.distortion)
 
@@ -230,6 +224,8 @@ def _eucm(u: Array, v: Array, k: Sequence[float]) -> tuple[Array, Array]:
 
 
 _DISTORT: dict[str, _Distort] = {
+    "SIMPLE_PINHOLE": _radial,
+    "PINHOLE": _radial,
     "SIMPLE_RADIAL": _radial,
     "RADIAL": _radial,
     "OPENCV": _opencv,
@@ -247,11 +243,9 @@ _DISTORT: dict[str, _Distort] = {
     "DIVISION": _division,
     "EUCM": _eucm,
 }
-_ZERO_IS_PINHOLE = (
-    "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "BROWN", "FOV", "SIMPLE_DIVISION", "DIVISION"
-)  # fmt: skip
+_STRAIGHT_AT_ZERO = (_radial, _opencv, _full_opencv, _brown, _fov, _division)
 # Models with one focal length, and the one that holds their distortion with two (zeros appended).
-_WITH_TWO_FOCALS = {
+_TWO_FOCALS = {
     "SIMPLE_PINHOLE": "PINHOLE",
     "SIMPLE_RADIAL": "OPENCV",
     "RADIAL": "OPENCV",

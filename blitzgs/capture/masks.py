@@ -6,25 +6,22 @@ from __future__ import annotations
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Container, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from itertools import product
 from pathlib import Path, PurePosixPath
 
 from blitzgs.capture.cameras import Camera, same_shape
-from blitzgs.capture.image_files import check_photograph, decode_mask, read_header, read_whole
-from blitzgs.capture.names import files_below, unified, what_is_at
-from blitzgs.util.errors import warn
+from blitzgs.capture.image_files import check_photograph, decode_mask, in_threads, read_header, read_whole
+from blitzgs.capture.names import IMAGE_SUFFIXES, any_case, files_below, unified, what_is_at
+from blitzgs.util.errors import located, warn
 
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".gif", ".webp", ".avif", ".jp2")
 # What programs call the mask of a.jpg, the names that are tried first first.
 _FORMS: tuple[str, ...] = ("{name}.png", "{stem}.png", "{name}", "{stem}_mask.png", "{stem}_mask{suffix}")
 _FORMS += ("{name}_mask.png", "{name}.mask.png", "{stem}.mask.png")
 # These with another suffix, after all others.
 _FORMS_OF_ANY_SUFFIX = ("{name}", "{stem}", "{stem}_mask")
-_FORMS_OF_A_PLACE = len(_FORMS) + 1 + len(_FORMS_OF_ANY_SUFFIX) * len(_SUFFIXES[1:])
+_FORMS_OF_A_PLACE = len(_FORMS) + 1 + len(_FORMS_OF_ANY_SUFFIX) * len(IMAGE_SUFFIXES)
 # Masks are decoded when the capture is loaded to see what they exclude.
 _SAMPLED = 8
-_THREADS = 16
 
 
 def find_masks(
@@ -51,12 +48,9 @@ def find_masks(
         if masks is not None:
             raise FileNotFoundError(f"{folder}: no such folder of masks")
         return list(given)
-    files = [name for name in files_below(folder) if PurePosixPath(name).suffix.lower() in _SUFFIXES]
+    files = [name for name in files_below(folder) if name.lower().endswith(IMAGE_SUFFIXES)]
     owners = _owners(folder, files, [None if path else name for name, path in zip(names, given, strict=True)])
-    found = [
-        path if path is not None or index not in owners else folder / owners[index]
-        for index, path in enumerate(given)
-    ]
+    found = [path or (folder / owners[i] if i in owners else None) for i, path in enumerate(given)]
     used = {path for path in found if path is not None}
     unused = [name for name in files if folder / name not in used]
     if files and not used:
@@ -78,26 +72,22 @@ def _owners(folder: Path, files: Sequence[str], names: Sequence[str | None]) -> 
     """
     by_path: dict[str, list[str]] = defaultdict(list)
     for file in files:
-        parts = PurePosixPath(unified(file).casefold()).parts
+        parts = PurePosixPath(any_case(file)).parts
         for begin in range(len(parts)):
             by_path["/".join(parts[begin:])].append(file)
-    claims: dict[str, list[tuple[int, int]]] = defaultdict(list)  # by file: ranks and images
+    claims: dict[str, dict[int, int]] = defaultdict(dict)  # by file: the rank of each image
     for index, name in enumerate(names):
-        if name is None:
-            continue
-        seen: set[str] = set()
-        for rank, place in enumerate(_places(name)):
-            for file in by_path.get(place.casefold(), ()):
+        for rank, place in enumerate(_places(name) if name is not None else ()):
+            for file in by_path.get(place, ()):
                 # The folder of masks may have a folder in front of the whole name: half a rank worse.
-                exact = unified(file).casefold() == place.casefold()
-                if file not in seen and (exact or rank < _FORMS_OF_A_PLACE):
-                    seen.add(file)
-                    claims[file].append((2 * rank + (not exact), index))
+                exact = any_case(file) == place
+                if exact or rank < _FORMS_OF_A_PLACE:
+                    claims[file].setdefault(index, 2 * rank + (not exact))
     owners: dict[int, tuple[int, str]] = {}
     doubtful: list[tuple[str, list[int]]] = []
     for file, claimed in claims.items():
-        best = min(rank for rank, _ in claimed)
-        images = [index for rank, index in claimed if rank == best]
+        best = min(claimed.values())
+        images = [index for index, rank in claimed.items() if rank == best]
         if len(images) > 1:
             doubtful.append((file, images))
         elif images[0] not in owners or best < owners[images[0]][0]:
@@ -120,14 +110,14 @@ def _places(name: str) -> Iterator[str]:
     images. Of a name that is absolute or leads out of its folder, only the last part is used: the whole name,
     joined to the folder of masks, could be the path of the photograph itself.
     """
-    path = PurePosixPath(unified(name))
+    path = PurePosixPath(any_case(name))
     parts = path.parts[-1:] if path.is_absolute() or ".." in path.parts else path.parts
     for begin in range(len(parts)):
         # A PNG's own name is better than that stem's: a.png belongs to the image a.png before a.jpg.
-        for form in (_FORMS[0], "{name}" if path.suffix.lower() == ".png" else "", *_FORMS[1:]):
+        for form in (_FORMS[0], "{name}" if path.suffix == ".png" else "", *_FORMS[1:]):
             own = form.format(name=path.name, stem=path.stem, suffix=path.suffix)
             yield "/".join((*parts[begin:-1], own))
-        for form, suffix in product(_FORMS_OF_ANY_SUFFIX, _SUFFIXES[1:]):
+        for form, suffix in product(_FORMS_OF_ANY_SUFFIX, IMAGE_SUFFIXES):
             yield "/".join((*parts[begin:-1], form.format(name=path.name, stem=path.stem) + suffix))
 
 
@@ -154,8 +144,7 @@ def check_mask_sizes(cameras: Sequence[Camera]) -> None:
             return None
         return None if header is None else misfit(camera, header.width, header.height)
 
-    with ThreadPoolExecutor(_THREADS) as pool:  # the files may be on a slow network disk
-        found = [text for text in pool.map(problem, cameras) if text is not None]
+    found = [text for text in in_threads(problem, cameras) if text is not None]
     if found:
         more = f" ({len(found)} masks do not fit)" if len(found) > 1 else ""
         raise ValueError(found[0] + more)
@@ -163,18 +152,24 @@ def check_mask_sizes(cameras: Sequence[Camera]) -> None:
 
 def check_masks(masks: Sequence[Path | None]) -> None:
     """Warn if a few of the masks exclude nothing, or everything; damaged ones are left to who needs them."""
+
+    def counted_share(path: Path) -> float | None:
+        try:
+            return float(decode_mask(read_whole(path)).mean())
+        except (OSError, ValueError):
+            return None
+
     paths = [path for path in dict.fromkeys(masks) if path is not None]
     sample = [paths[i * len(paths) // min(_SAMPLED, len(paths))] for i in range(min(_SAMPLED, len(paths)))]
-    with ThreadPoolExecutor(_SAMPLED) as pool:
-        shares = [share for share in pool.map(_share, sample) if share is not None]
+    shares = [share for share in in_threads(counted_share, sample) if share is not None]
     if not shares:
         return
-    if max(shares) == 0:
+    if min(shares) == 1:
         warn(
             f"the masks exclude nothing ({len(shares)} of {len(paths)} were looked at; first: {sample[0]}): "
             "black or transparent pixels are excluded, all others count"
         )
-    elif min(shares) == 1:
+    elif max(shares) == 0:
         warn(
             f"the masks exclude every pixel ({len(shares)} of {len(paths)} were looked at; first: "
             f"{sample[0]}): black or transparent pixels are excluded, and in lossy files (JPEG) dark ones "
@@ -182,28 +177,20 @@ def check_masks(masks: Sequence[Path | None]) -> None:
         )
 
 
-def _share(path: Path) -> float | None:
-    try:
-        return 1.0 - float(decode_mask(read_whole(path)).mean())
-    except (OSError, ValueError):
-        return None
+def check_files(photograph: Path, mask: Path | None, is_whole: bool = False) -> bool:
+    """Check that a photograph and its mask can be decoded, and tell whether some pixel counts.
+
+    `is_whole`: the photograph is opaque and was checked before. ValueError, OSError: one cannot be decoded.
+    """
+    has_pixels = is_whole or check_photograph(photograph)
+    if mask is None:
+        return has_pixels
+    with located("the mask"):
+        return bool(decode_mask(read_whole(mask)).any()) and has_pixels
 
 
 # Returns what is wrong with photographs and their masks, as `damaged` does.
 FindDamage = Callable[[Sequence[tuple[Path, Path | None]]], dict[int, str]]
-
-
-def mask_error(error: Exception) -> ValueError:
-    """Return an error that says that the file is a mask."""
-    return ValueError(f"the mask {error}")
-
-
-def read_mask_file(path: Path) -> None:
-    """Decode a mask (ValueError: it is damaged; says that it is a mask)."""
-    try:
-        decode_mask(read_whole(path))
-    except ValueError as error:
-        raise mask_error(error) from error
 
 
 def damaged(files: Sequence[tuple[Path, Path | None]]) -> dict[int, str]:
@@ -211,35 +198,22 @@ def damaged(files: Sequence[tuple[Path, Path | None]]) -> dict[int, str]:
 
     def problem(pair: tuple[Path, Path | None]) -> str | None:
         try:
-            check_photograph(pair[0])
-            if pair[1] is not None:
-                read_mask_file(pair[1])
+            check_files(*pair)
         except (OSError, ValueError) as error:
             return str(error)
         return None
 
-    with ThreadPoolExecutor(_THREADS) as pool:
-        return {i: text for i, text in enumerate(pool.map(problem, files)) if text is not None}
+    return {i: text for i, text in enumerate(in_threads(problem, files)) if text is not None}
 
 
 class FileCheck:
     """Checks the files of views one after the other in a thread of its own, while others are in use."""
 
-    def __init__(
-        self,
-        cameras: Sequence[Camera],
-        order: Sequence[int],
-        counted: Callable[[Camera], bool],
-        whole: Container[Path],
-    ) -> None:
-        """Start to check files.
-
-        `counted`: decodes a view's mask, and tells whether some pixel counts. `whole`: files of opaque
-        photographs that others have checked meanwhile.
-        """
+    def __init__(self, cameras: Sequence[Camera], whole: Container[Path]) -> None:
+        """Start to check files; `whole` are those of opaque photographs that others have read meanwhile."""
         # What is wrong with the first damaged file that was found; None so far.
         self.damage: str | None = None
-        self._cameras, self._order, self._counted, self._whole = cameras, order, counted, whole
+        self._cameras, self._whole = cameras, whole
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="blitzgs-check", daemon=True)
         self._thread.start()
@@ -255,19 +229,15 @@ class FileCheck:
 
     def _run(self) -> None:
         blank = []
-        for index in self._order:
+        for camera in self._cameras:
             if self._stop.is_set():
                 return
-            camera = self._cameras[index]
             try:
-                has_pixels = camera.image_path in self._whole or check_photograph(camera.image_path)
-                if camera.mask_path is not None:
-                    has_pixels = self._counted(camera) and has_pixels
+                if not check_files(camera.image_path, camera.mask_path, camera.image_path in self._whole):
+                    blank.append(camera.name)
             except (OSError, ValueError) as error:
                 self.damage = str(error)
                 return
-            if not has_pixels:
-                blank.append(camera.name)
         if blank:
             warn(
                 f"{len(blank)} photographs have no pixel that counts, as they are transparent or masked "

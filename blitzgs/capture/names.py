@@ -12,7 +12,7 @@ import re
 import stat
 import unicodedata
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from pathlib import Path, PurePath, PurePosixPath
 
 from blitzgs.capture.cameras import SourceView
@@ -24,8 +24,9 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".a
 # Of photographs that have to be converted; the cameras may have been found before that.
 _CONVERTED_SUFFIXES = (".heic", ".heif", ".dng", ".arw", ".cr2", ".cr3", ".nef", ".orf", ".rw2", ".jxl")
 _VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mts", ".insv", ".360")
-# Folders of what belongs to photographs and has their names, but shows something else.
-_BY_PRODUCT = re.compile(r"(?i)(^|/)(depth|normal|disp|mask|alpha|segmentation|semantic)[^/]*/")
+# How folders and files are called that belong to photographs and have their names, but show something else.
+BY_PRODUCTS = "depth|normal|disp|mask|alpha|segmentation|semantic"
+_BY_PRODUCT = re.compile(rf"(?i)(^|/)({BY_PRODUCTS})[^/]*/")
 # Of folders in each other.
 _DEEPEST = 8
 
@@ -40,17 +41,28 @@ def relative_to(root: Path, path: Path) -> Path:
     return path.relative_to(root) if path.is_relative_to(root) else path
 
 
-def _any_case(name: str) -> str:
+def any_case(name: str) -> str:
+    """Return a path as `unified` does, in lower case."""
     return unified(name).casefold()
 
 
+def by_parts(names: Iterable[str]) -> dict[str, list[int]]:
+    """Return the indices of names by their lower-case forms with and without folders and suffix."""
+    found = defaultdict(list)
+    for index, name in enumerate(names):
+        path = PurePosixPath(any_case(name))
+        for key in {str(path), str(path).removesuffix(path.suffix), path.name, path.stem}:
+            found[key].append(index)
+    return found
+
+
 def _without_suffix(name: str) -> str:
-    path = PurePosixPath(_any_case(name))
+    path = PurePosixPath(any_case(name))
     return str(path.with_suffix("")) if path.suffix in IMAGE_SUFFIXES + _CONVERTED_SUFFIXES else str(path)
 
 
 def _last(name: str) -> str:
-    return PurePosixPath(_any_case(name)).name
+    return PurePosixPath(any_case(name)).name
 
 
 # What is ignored, and whether files that were found by stricter rules rule it out: where some photographs are
@@ -58,10 +70,10 @@ def _last(name: str) -> str:
 _Rule = tuple[str, Callable[[str], str], bool]
 _RULES: tuple[_Rule, ...] = (
     ("slashes and composed letters", unified, False),
-    ("upper and lower case", _any_case, False),
+    ("upper and lower case", any_case, False),
     ("suffixes", _without_suffix, True),
     ("folders", _last, True),
-    ("folders that became part of the name", lambda name: _any_case(name).replace("/", "_"), True),
+    ("folders that became part of the name", lambda name: any_case(name).replace("/", "_"), True),
     ("folders and suffixes", lambda name: _without_suffix(_last(name)), True),
 )
 
@@ -75,24 +87,16 @@ def match_names(names: Iterable[str], found: Sequence[str], folder: Path) -> dic
     if not wanted or not folder.is_dir():
         return {}
     taken = {unified(name) for name in found}
-    suffixes = {PurePosixPath(unified(name)).suffix.lower() for name in found}
+    suffixes = {_suffix(name) for name in found}
     free = [file for file in files_below(folder) if unified(file) not in taken]
     matches: dict[str, Path] = {}
     for ignored, key, is_last_resort in _RULES:
-        files, claims = defaultdict(list), defaultdict(list)
-        for file in free:
-            if not (is_last_resort and file.lower().endswith(_CONVERTED_SUFFIXES)):
-                files[key(file)].append(file)
-        for name in wanted:
-            if not (is_last_resort and PurePosixPath(unified(name)).suffix.lower() in suffixes):
-                claims[key(name)].append(name)
+        files = _alone(free, key, _CONVERTED_SUFFIXES if is_last_resort else ())
+        claims = _alone(wanted, key, suffixes if is_last_resort else ())
         new = {
-            claimed[0]: files[place][0]
-            for place, claimed in claims.items()
-            if _is_alike(claimed[0], files.get(place, [""])[0])
-            and len(claimed) == 1
-            and len(files.get(place, ())) == 1
-            and (folder / files[place][0]).is_file()
+            name: files[place]
+            for place, name in claims.items()
+            if place in files and _is_alike(name, files[place]) and (folder / files[place]).is_file()
         }
         if not new:
             continue
@@ -105,10 +109,21 @@ def match_names(names: Iterable[str], found: Sequence[str], folder: Path) -> dic
         used = set(new.values())
         free = [file for file in free if file not in used]
         wanted = [name for name in wanted if name not in new]
-        suffixes |= {PurePosixPath(unified(name)).suffix.lower() for name in new}
-        if not wanted:
-            break
+        suffixes |= {_suffix(name) for name in new}
     return matches
+
+
+def _alone(names: Iterable[str], key: Callable[[str], str], without: Container[str]) -> dict[str, str]:
+    """Return the names whose key no other one has, by their keys; not those of some suffixes."""
+    groups = defaultdict(list)
+    for name in names:
+        if _suffix(name) not in without:
+            groups[key(name)].append(name)
+    return {place: some[0] for place, some in groups.items() if len(some) == 1}
+
+
+def _suffix(name: str) -> str:
+    return PurePosixPath(any_case(name)).suffix
 
 
 def _is_alike(name: str, file: str) -> bool:
@@ -148,17 +163,10 @@ def to_convert(names: Iterable[str]) -> str:
 def what_is_at(path: Path) -> str | None:
     """Return what a path is instead of a file, as text; None: nothing is there, or a file."""
     try:
-        mode = path.lstat().st_mode
-        if stat.S_ISLNK(mode):
-            target = os.readlink(path)
-            try:
-                mode = path.stat().st_mode
-            except FileNotFoundError:
-                return f"a link to {target}, which does not exist"
-            except OSError as error:
-                return f"a link to {target}: {os.strerror(error.errno or 0)}"
-    except (OSError, ValueError):
-        return None
+        mode = path.stat().st_mode
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None)
+        return f"a link to {os.readlink(path)}: {why}" if path.is_symlink() else None
     kinds = (
         (stat.S_ISDIR, "a folder"),
         (stat.S_ISFIFO, "a named pipe"),
@@ -198,9 +206,6 @@ def _is_below(path: str, folders: Sequence[str]) -> bool:
     return any(os.path.commonpath([path, folder]) == folder for folder in folders)
 
 
-_SUFFIXES = (".jpg", ".JPG", ".jpeg", ".png", ".PNG")
-
-
 class MissingImagesError(FileNotFoundError):
     """Some of the images that a capture names are not on disk."""
 
@@ -216,31 +221,47 @@ def find_images(
     if downscale > 1 and float(downscale).is_integer():
         folder = root / f"{images}_{int(downscale)}"
         if folder.is_dir():
-            paths = [_with_any_suffix(folder / name) for name in names]
-            problem = _first_problem(folder, names, lenses, paths, downscale)
+            found = [_first_file(_of_any_suffix(folder / name)) for name in names]
+            problem = _first_problem(folder, names, lenses, found, downscale)
             if problem is None:
-                return [path for path in paths if path is not None]
+                return [path for path in found if path is not None]
             warn(f"{problem}; downscaling {images} instead")
     mapping = _mega_nerf_mapping(root)
-    files = {name: _find(root, images, name, mapping.get(name)) for name in names}
-    lost = [name for name, path in files.items() if not path.is_file()]
-    found = list(files.keys() - set(lost))
-    files |= match_names(lost, found, root / images)
+
+    def places(name: str) -> Iterator[Path]:
+        yield root / images / name
+        for folder in ("", "train/rgbs", "val/rgbs", "train/images", "val/images", "rgbs"):
+            yield root / folder / name
+            yield root / folder / PurePath(name).name
+            if name in mapping:
+                yield from _of_any_suffix(root / folder / mapping[name])
+
+    files = find_files(names, places, root / images)
     return [files[name] for name in names]
 
 
-def _find(root: Path, images: str, name: str, mapped: str | None) -> Path:
-    first = root / images / name
-    if first.is_file():
-        return first
-    for folder in ("", "train/rgbs", "val/rgbs", "train/images", "val/images", "rgbs"):
-        base = root / folder
-        for path in (base / name, base / PurePath(name).name):
-            if path.is_file():
-                return path
-        if mapped is not None and (found := _with_any_suffix(base / mapped)) is not None:
-            return found
-    return first
+def find_files(
+    names: Iterable[str], places: Callable[[str], Iterable[Path]], folder: Path
+) -> dict[str, Path]:
+    """Return the file of each name: in the first of its places that has one, or what `match_names` finds.
+
+    For a name without a file, it is the first place.
+    """
+    files = {name: _first_file(places(name)) for name in names}
+    there = {name: path for name, path in files.items() if path is not None}
+    lost = {name: next(iter(places(name))) for name in files if name not in there}
+    found = [relative_to(folder, path).as_posix() for path in there.values()]
+    return there | lost | match_names(lost, found, folder)
+
+
+def _first_file(paths: Iterable[Path]) -> Path | None:
+    return next((path for path in paths if path.is_file()), None)
+
+
+def _of_any_suffix(path: Path) -> Iterator[Path]:
+    yield path
+    for suffix in (".jpg", ".JPG", ".jpeg", ".png", ".PNG"):
+        yield path.with_suffix(suffix)
 
 
 def _first_problem(
@@ -255,12 +276,6 @@ def _first_problem(
             have, full = f"{header.width} x {header.height}", f"{lens.width} x {lens.height}"
             return f"{path} is {have}, not 1/{downscale:g} of {full}"
     return None
-
-
-def _with_any_suffix(path: Path) -> Path | None:
-    if path.is_file():
-        return path
-    return next((p for suffix in _SUFFIXES if (p := path.with_suffix(suffix)).is_file()), None)
 
 
 def _mega_nerf_mapping(root: Path) -> dict[str, str]:
@@ -305,21 +320,22 @@ def existing(views: Sequence[SourceView], root: Path, images: str, allow: bool) 
     message = f"{len(missing)} of {len(views)} images are not in {folder}: {shown}"
     if instead := _instead(folder, missing):
         message, remedy = f"{message}; {instead}", "put the photographs themselves there"
-        if not allow:
-            raise MissingImagesError(f"{message}: {remedy}, or leave those views out with allow_missing")
-    if not found and are_paths:
-        raise FileNotFoundError(f"{message}; put them there, or correct file_path in its transforms.json")
-    if not found:
+    elif found:
+        remedy = "put them back"
+    elif are_paths:
+        remedy = "put them there, or correct file_path in its transforms.json"
+    else:
+        remedy = "name their folder, relative to the capture, with --data.images=FOLDER"
         # A user may name the folder of the model, CAPTURE/sparse/0.
         above = next((folder for folder in root.resolve().parents[:2] if (folder / images).is_dir()), None)
-        if above is not None and not (root / images).is_dir():
-            raise FileNotFoundError(f"{message}; the capture may be the folder above: --data={above}")
-        remedy = "put them there, or name their folder, relative to the capture, with --data.images=FOLDER"
-        if not (root / images).is_dir():
-            remedy = "name their folder, relative to the capture, with --data.images=FOLDER"
+        if (root / images).is_dir():
+            remedy = f"put them there, or {remedy}"
+        elif above is not None:
+            remedy = f"the capture may be the folder above: --data={above}"
+    if not found:
         raise FileNotFoundError(f"{message}; {remedy}")
     if not allow:
-        raise MissingImagesError(f"{message}; put them back, or leave those views out with allow_missing")
+        raise MissingImagesError(f"{message}; {remedy}, or leave those views out with allow_missing")
     warn(f"{message}; dropped")
     return found
 

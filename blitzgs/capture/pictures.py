@@ -8,14 +8,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from blitzgs.capture.image_files import UInt8
 from blitzgs.util.errors import check_tensor
 from blitzgs.util.output import write_file
-
-UInt8 = npt.NDArray[np.uint8]
 
 # The error that the last colour of an error map shows.
 _FULL_ERROR = 0.25

@@ -24,20 +24,6 @@ _CHUNK = 2_000_000
 _GREY = 128
 
 
-def read_points(path: Path) -> tuple[Float64, npt.NDArray[np.uint8] | None, Any]:
-    """Return positions and colours [M, 3] (None: the file has none), and the reference system or None.
-
-    ImportError: the package that reads the format is not installed. ValueError: the file is damaged; names
-    it.
-    """
-    try:
-        return _read_e57(path) if path.suffix.lower() == ".e57" else _read_las(path)
-    except (ImportError, MemoryError):
-        raise
-    except Exception as error:  # the packages raise all kinds of errors for damaged files
-        raise ValueError(f"{path} cannot be read ({error}): export the points again, or as PLY") from error
-
-
 def _step(path: Path, count: int) -> int:
     """Return of how many points one is kept, and say it."""
     step = max(1, -(-count // _MOST))
@@ -46,7 +32,7 @@ def _step(path: Path, count: int) -> int:
     return step
 
 
-def _read_las(path: Path) -> tuple[Float64, npt.NDArray[np.uint8] | None, Any]:
+def _read_las(path: Path) -> SourcePoints:
     laspy = optional_package("laspy", "geo", f"{path}: reading it")
     with laspy.open(path) as reader:
         header = reader.header
@@ -68,12 +54,13 @@ def _read_las(path: Path) -> tuple[Float64, npt.NDArray[np.uint8] | None, Any]:
             crs = None
     found = np.concatenate(colors)
     if not has_color or not found.any():
-        return np.concatenate(positions), None, crs
+        return SourcePoints.grey(np.concatenate(positions), crs)
     # The format has 16 bits, but some programs write bytes.
-    return np.concatenate(positions), (found >> (8 if found.max() > 255 else 0)).astype(np.uint8), crs
+    uint8 = (found >> (8 if found.max() > 255 else 0)).astype(np.uint8)
+    return SourcePoints(np.concatenate(positions), uint8, colors_from="red, green, blue", crs=crs)
 
 
-def _read_e57(path: Path) -> tuple[Float64, npt.NDArray[np.uint8] | None, None]:
+def _read_e57(path: Path) -> SourcePoints:
     pye57 = optional_package("pye57", "geo", f"{path}: reading it")
     file = pye57.E57(str(path))
     try:
@@ -92,11 +79,12 @@ def _read_e57(path: Path) -> tuple[Float64, npt.NDArray[np.uint8] | None, None]:
         file.close()
     found = np.concatenate(colors)
     if not len(found) or np.isnan(found).all():
-        return np.concatenate(positions), None, None
+        return SourcePoints.grey(np.concatenate(positions))
     white = 255.0 if np.nanmax(found) > 1 else 1.0
     white = 65535.0 if np.nanmax(found) > 255 else white
     scaled = np.where(np.isnan(found), _GREY, found * (255 / white))
-    return np.concatenate(positions), np.clip(scaled + 0.5, 0, 255).astype(np.uint8), None
+    uint8 = np.clip(scaled + 0.5, 0, 255).astype(np.uint8)
+    return SourcePoints(np.concatenate(positions), uint8, colors_from="red, green, blue")
 
 
 # Points in the world of transforms.json, by the programs that write them beside it: nerfstudio and INRIA's.
@@ -123,33 +111,51 @@ class SourcePoints:
         return {name: column for name, column in found.items() if column is not None}
 
     @classmethod
-    def none(cls) -> SourcePoints:
-        """Return no points."""
-        return cls(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8))
+    def grey(cls, positions: Float64, crs: Any = None) -> SourcePoints:
+        """Return points without colours."""
+        return cls(positions, np.full(positions.shape, _GREY, np.uint8), crs=crs)
 
     @classmethod
-    def of_model(cls, points: colmap.ColmapPoints, path: Path | None, colors_from: str) -> SourcePoints:
-        """Return the points of a COLMAP model."""
-        return cls(points.positions, points.colors, points.track_lengths, points.errors, path, colors_from)
+    def none(cls) -> SourcePoints:
+        """Return no points."""
+        return cls.grey(np.zeros((0, 3)))
+
+
+def model_points(model: colmap.ColmapModel) -> SourcePoints:
+    """Return the points of a COLMAP model, which may be in a file of another program."""
+    path, points = model.points_path, model.points
+    if path is not None and path.suffix in colmap.POINT_SUFFIXES:
+        return file_points(path)
+    columns = (points.positions, points.colors, points.track_lengths, points.errors)
+    return SourcePoints(*columns, path, "the model's own colours")
 
 
 def file_points(path: Path) -> SourcePoints:
-    """Read the points of a PLY, LAS, LAZ or E57 file; warn if they have no colours; errors: `read_points`."""
+    """Read the points of a PLY, LAS, LAZ or E57 file; warn if they have no colours.
+
+    ImportError: the package that reads the format is not installed. FileNotFoundError: there is no such file.
+    ValueError: it is damaged; names it.
+    """
     if not path.is_file():
         raise FileNotFoundError(f"{path} is missing: put the file of points there, or correct its name")
+    hint = ""
     if path.suffix.lower() in SUFFIXES:
-        positions, colors, crs = read_points(path)
-        if colors is not None:
-            return SourcePoints(positions, colors, path=path, colors_from="red, green, blue", crs=crs)
-        warn(f"{path}: the points have no colours and start grey")
-        return SourcePoints(positions, np.full(positions.shape, _GREY, np.uint8), path=path, crs=crs)
-    cloud = read_point_cloud(path)
-    if not cloud.colors_from and len(cloud.positions):
-        warn(
-            f"{path}: the points have no colours and start grey: the file has {', '.join(cloud.properties)}, "
-            "and colours are read from red, green and blue"
-        )
-    return SourcePoints(cloud.positions, cloud.colors, path=path, colors_from=cloud.colors_from)
+        try:
+            points = _read_e57(path) if path.suffix.lower() == ".e57" else _read_las(path)
+        except (ImportError, MemoryError):
+            raise
+        except Exception as error:  # the packages raise all kinds of errors for damaged files
+            raise ValueError(
+                f"{path} cannot be read ({error}): export the points again, or as PLY"
+            ) from error
+    else:
+        cloud = read_point_cloud(path)
+        points = SourcePoints(cloud.positions, cloud.colors, colors_from=cloud.colors_from)
+        hint = f": the file has {', '.join(cloud.properties)}, and colours are read from red, green and blue"
+    points.path = path
+    if not points.colors_from and len(points.positions):
+        warn(f"{path}: the points have no colours and start grey{hint}")
+    return points
 
 
 def transforms_points(root: Path, content: Transforms, model: Path | None) -> SourcePoints:
@@ -180,10 +186,7 @@ def _model_points(root: Path, content: Transforms, folder: Path) -> SourcePoints
             f"{folder.relative_to(root)} are not used: {reason}; name a PLY with ply_file_path"
         )
         return None
-    if model.points_path is not None and model.points_path.suffix in colmap.POINT_SUFFIXES:
-        points = file_points(model.points_path)
-    else:
-        points = SourcePoints.of_model(model.points, folder, "the model")
+    points = model_points(model)
     points.positions = content.moved(points.positions)
     return points
 

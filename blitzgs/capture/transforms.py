@@ -7,18 +7,19 @@ world-to-camera with y down, z forwards.
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 
-from blitzgs.capture.cameras import Float64, SourceView
-from blitzgs.capture.names import match_names
+from blitzgs.capture.cameras import Float64, SourceView, pose_of
+from blitzgs.capture.fields import Fields, entry, read_json
+from blitzgs.capture.names import find_files
 from blitzgs.capture.transforms_lens import FIELDS, read_lens
+from blitzgs.util.errors import located
 
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 _PARTS = ("train", "val", "test")
@@ -26,23 +27,24 @@ _PARTS = ("train", "val", "test")
 _KNOWN = FIELDS | {
     "frames", "file_path", "mask_path", "transform_matrix", "ply_file_path", "train_filenames",
     "val_filenames", "test_filenames", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2",
-}  # fmt: skip
-# Fields of nerfstudio, instant-ngp and Blender that concern their own programs.
-_OF_OTHERS = {
+    # Of nerfstudio, instant-ngp and Blender, for their own programs.
     "aabb_scale", "scale", "offset", "from_na", "applied_transform", "applied_scale", "orientation_override",
     "sharpness", "colmap_im_id", "colmap_image_id", "depth_file_path", "rotation", "time", "n_frames",
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass
 class Transforms:
     """The combined content of a capture's files."""
 
-    frames: list[SourceView]
-    points_path: Path | None
     files: list[Path]
-    split: str  # what in the files decides on the split, as text; empty if nothing does
-    notes: list[str]  # what was decided between fields, and which fields have no effect
+    frames: list[SourceView] = field(default_factory=list)
+    points_path: Path | None = None
+    split: list[str] = field(
+        default_factory=list
+    )  # what in the files decides on the split, if something does
+    # What was decided between fields, and which fields have no effect, as keys.
+    notes: dict[str, None] = field(default_factory=dict)
     applied: Float64 | None = None  # [3, 4] what nerfstudio applied to COLMAP's world, where it says so
 
     def moved(self, positions: Float64) -> Float64:
@@ -65,104 +67,91 @@ def read_transforms(root: Path, files: Sequence[Path] | None = None) -> Transfor
 
     ValueError: a field is missing or makes no sense; names the file, the frame and the field.
     """
-    frames: list[SourceView] = []
-    points_path, applied = None, None
-    files = find_transforms(root) if files is None else list(files)
-    notes: dict[str, None] = {}
+    read = Transforms(find_transforms(root) if files is None else list(files))
     ignored: dict[str, None] = {}
-    split: list[str] = []
-    for path in files:
-        content, entries = _read_file(path)
-        if "ply_file_path" in content:
-            if not _names_file(content, "ply_file_path"):
-                raise ValueError(f"{path}: ply_file_path must name a file, got {content['ply_file_path']!r}")
-            points_path = _found(root, [content["ply_file_path"]]).popitem()[1]
-        applied = _applied(path, content) if applied is None else applied
-        lists = _lists(path, content)
-        split += [f"{key}_filenames" for key in lists] if path.name == "transforms.json" else [path.name]
-        own: list[SourceView] = []
-        named = [
-            entry[key] for key in ("file_path", "mask_path") for entry in entries if _names_file(entry, key)
-        ]
-        paths = _found(root, named)
-        for index, entry in enumerate(entries):
-            try:
-                if not isinstance(entry, dict):
-                    raise TypeError(
-                        f"must be an object with file_path and transform_matrix, got {entry!r:.40}"
-                    )
-                own.append(_read_frame(path, content, entry, lists, notes, paths))
-            except (KeyError, TypeError, ValueError, ArithmeticError) as error:
-                reason = f"the field {error} is missing" if isinstance(error, KeyError) else str(error)
-                raise ValueError(f"{path}: frame {index}: {reason}") from error
-            ignored |= dict.fromkeys(key for key in entry if key not in _KNOWN | _OF_OTHERS)
-        ignored |= dict.fromkeys(key for key in content if key not in _KNOWN | _OF_OTHERS)
-        if lost := set().union(*lists.values()) - {frame.name for frame in own}:
-            keys = " or ".join(f"{part}_filenames" for part in lists)
-            raise ValueError(
-                f"{path}: {keys} name {len(lost)} images that are no frames (first: {min(lost)})"
-            )
-        frames += own
+    for path in read.files:
+        with located(str(path)):
+            ignored |= _read_file(root, path, read)
     if ignored:
         shown = ", ".join(f"{key:.40}" for key in list(ignored)[:8]) + (", ..." if len(ignored) > 8 else "")
-        notes[f"fields without effect: {shown}"] = None
-    counts = Counter(frame.path for frame in frames)
-    if twice := sorted({frame.name for frame in frames if counts[frame.path] > 1}):
+        read.notes[f"fields without effect: {shown}"] = None
+    counts = Counter(frame.path for frame in read.frames)
+    if twice := sorted({frame.name for frame in read.frames if counts[frame.path] > 1}):
         shown = ", ".join(twice[:5]) + (", ..." if len(twice) > 5 else "")
-        raise ValueError(
-            f"{' and '.join(map(str, files))}: images of more than one frame: {shown}; keep one frame of each"
-        )
-    return Transforms(frames, points_path, files, " and ".join(split), list(notes), applied)
+        where = " and ".join(map(str, read.files))
+        raise ValueError(f"{where}: images of more than one frame: {shown}; keep one frame of each")
+    return read
 
 
-def _applied(file: Path, content: Mapping[str, Any]) -> Float64 | None:
+def _read_file(root: Path, path: Path, read: Transforms) -> dict[str, None]:
+    """Add the content of a file; return the fields that have no effect."""
+    with located("not a transforms file"):
+        content = read_json(path)
+        frames = entry(content, "frames", list)
+    if "ply_file_path" in content:
+        points = _file_name(content, "ply_file_path")
+        read.points_path = _found(root, [points])[points]
+    read.applied = _applied(content) if read.applied is None else read.applied
+    is_whole = path.name == "transforms.json"
+    lists = _lists(content) if is_whole else {}
+    read.split += [f"{part}_filenames" for part in lists] if is_whole else [path.name]
+    fields = [frame for frame in frames if isinstance(frame, dict)]
+    named = [frame.get(key) for key in ("file_path", "mask_path") for frame in fields]
+    paths = _found(root, [str(name) for name in named if _is_file_name(name)])
+    own = []
+    for index, frame in enumerate(frames):
+        with located(f"frame {index}"):
+            view = _read_frame(content, frame, paths, read.notes)
+        part = "train" if path.name == "transforms_train.json" else "test"
+        own.append(replace(view, part=_part(lists, view.name) if is_whole else part))
+    if lost := set().union(*lists.values()) - {frame.name for frame in own}:
+        keys = " or ".join(f"{part}_filenames" for part in lists)
+        raise ValueError(f"{keys} name {len(lost)} images that are no frames (first: {min(lost)})")
+    read.frames += own
+    return dict.fromkeys(key for level in (*frames, content) for key in level if key not in _KNOWN)
+
+
+def _read_frame(content: Fields, frame: Any, paths: Mapping[str, Path], notes: dict[str, None]) -> SourceView:
+    if not isinstance(frame, dict):
+        raise ValueError(f"must be an object with file_path and transform_matrix, got {frame!r:.40}")
+    relative = _file_name(frame, "file_path")
+    mask = None if frame.get("mask_path") is None else paths[_file_name(frame, "mask_path")]
+    lens = read_lens(content, frame, paths[relative], notes)
+    pose = _read_pose(entry(frame, "transform_matrix", list))
+    return SourceView(_name(relative), paths[relative], mask, lens, pose)
+
+
+def _applied(content: Fields) -> Float64 | None:
     """Return nerfstudio's applied_transform and applied_scale as one matrix; None: there is neither."""
     if "applied_transform" not in content and "applied_scale" not in content:
         return None
     try:
         matrix = np.asarray(content.get("applied_transform", np.eye(4)), dtype=np.float64)[:3]
         scale = float(content.get("applied_scale", 1.0))
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{file}: applied_transform must be 3 x 4 and applied_scale a number") from error
+    except (TypeError, ValueError, IndexError, OverflowError) as error:
+        raise ValueError("applied_transform must be 3 x 4 and applied_scale a number") from error
     if matrix.shape != (3, 4):
-        raise ValueError(f"{file}: applied_transform must be 3 x 4, got the shape {matrix.shape}")
+        raise ValueError(f"applied_transform must be 3 x 4, got the shape {matrix.shape}")
     return matrix * scale
 
 
+def _is_file_name(value: object) -> bool:
+    return isinstance(value, str) and bool(PurePath(value).name)
+
+
+def _file_name(fields: Fields, key: str) -> str:
+    if not _is_file_name(fields.get(key)):
+        raise ValueError(f"{key} must name a file, got {fields.get(key)!r:.40}")
+    return str(fields[key])
+
+
 def _found(root: Path, names: Sequence[str]) -> dict[str, Path]:
-    """Return the file of each name, also if it is written in another notation (`names.match_names`)."""
-    paths = {
-        name: next((p for s in _SUFFIXES if (p := root / (name + s)).is_file()), root / _name(name))
-        for name in names
-    }
-    there = [
-        path.relative_to(root).as_posix()
-        for path in paths.values()
-        if path.is_relative_to(root) and ".." not in path.parts and path.is_file()
-    ]
-    lost = [name for name, path in paths.items() if not path.is_file()]
-    return paths | match_names(lost, there, root)
+    """Return the file of each name; a name may lack its suffix, as Blender's do."""
+    return find_files(names, lambda name: (root / (_name(name) + suffix) for suffix in _SUFFIXES), root)
 
 
-def _read_file(path: Path) -> tuple[dict[str, Any], list[Any]]:
-    """Return the root of a file and its frames."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: not a transforms file: no JSON ({error}); export it again") from error
-    if not isinstance(content, dict):
-        kind = "null" if content is None else "a list" if isinstance(content, list) else f"{content!r:.40}"
-        raise ValueError(f"{path}: not a transforms file with a list of frames: its content is {kind}")
-    if not isinstance(content.get("frames"), list):
-        what = "there are none" if "frames" not in content else f"they are {content['frames']!r:.40}"
-        raise ValueError(f"{path}: not a transforms file with a list of frames: {what}")
-    return content, content["frames"]
-
-
-def _lists(file: Path, content: Mapping[str, Any]) -> dict[str, set[str]]:
+def _lists(content: Fields) -> dict[str, set[str]]:
     """Return the names in the lists of a file's split, as far as it has them."""
-    if file.name != "transforms.json":
-        return {}
     lists = {}
     for part in _PARTS:
         key = f"{part}_filenames"
@@ -170,15 +159,13 @@ def _lists(file: Path, content: Mapping[str, Any]) -> dict[str, set[str]]:
             continue
         names = content[key]
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise ValueError(f"{file}: {key} must be a list of the file_path of frames")
+            raise ValueError(f"{key} must be a list of the file_path of frames")
         lists[part] = {_name(name) for name in names}
     return lists
 
 
-def _part(file: Path, lists: Mapping[str, set[str]], name: str) -> str | None:
-    """Return the part of a frame, see `SourceView.part`."""
-    if file.name != "transforms.json":
-        return "train" if file.name == "transforms_train.json" else "test"
+def _part(lists: Mapping[str, set[str]], name: str) -> str | None:
+    """Return the part of a frame by the lists of its file, see `SourceView.part`."""
     if not lists:
         return None
     held_out = any(name in lists.get(part, ()) for part in ("val", "test"))
@@ -194,44 +181,13 @@ def _name(relative: str) -> str:
     return str(Path(relative.replace("\\", "/")))
 
 
-def _names_file(entry: object, key: str) -> bool:
-    return isinstance(entry, dict) and isinstance(entry.get(key), str) and bool(PurePath(entry[key]).name)
-
-
-def _read_frame(
-    file: Path,
-    content: Mapping[str, Any],
-    entry: Mapping[str, Any],
-    lists: Mapping[str, set[str]],
-    notes: dict[str, None],
-    paths: Mapping[str, Path],
-) -> SourceView:
-    relative = entry["file_path"]
-    if not _names_file(entry, "file_path"):
-        raise ValueError(f"file_path must name an image, got {relative!r}")
-    path = paths[relative]
-    mask = entry.get("mask_path")
-    if mask is not None and not _names_file(entry, "mask_path"):
-        raise ValueError(f"mask_path must name an image or be null, got {mask!r}")
-    name = _name(relative)
-    return SourceView(
-        name=name,
-        path=path,
-        mask_path=None if mask is None else paths[mask],
-        lens=read_lens(content, entry, path, notes),
-        world_to_camera=_read_pose(entry["transform_matrix"]),
-        part=_part(file, lists, name),
-    )
-
-
 def _read_pose(matrix: object) -> Float64:
     try:
         camera_to_world = np.asarray(matrix, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError("transform_matrix must be 4 x 4 numbers") from error
     if camera_to_world.shape not in ((3, 4), (4, 4)):
         raise ValueError(f"transform_matrix must be 4 x 4, got the shape {camera_to_world.shape}")
-    pose = np.eye(4)
     rotation = camera_to_world[:3, :3] * np.array([1.0, -1.0, -1.0])
     if np.isfinite(camera_to_world).all():  # views whose pose is not finite are dropped later
         lengths = np.linalg.norm(rotation, axis=0)
@@ -251,6 +207,4 @@ def _read_pose(matrix: object) -> Float64:
             raise ValueError("transform_matrix is not a rotation and a translation")
         if np.linalg.det(rotation) < 0:
             raise ValueError("transform_matrix mirrors the scene: one of its axes has the wrong sign")
-    pose[:3, :3] = rotation.T
-    pose[:3, 3] = -rotation.T @ camera_to_world[:3, 3]
-    return pose
+    return pose_of(rotation, camera_to_world[:3, 3])

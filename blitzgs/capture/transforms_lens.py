@@ -9,35 +9,24 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from blitzgs.capture.colmap import camera_models
+from blitzgs.capture.fields import Fields, number
 from blitzgs.capture.image_files import read_header
 from blitzgs.capture.lens import Lens
 
-Fields = Mapping[str, Any]
-
-_OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-_FISHEYE = ("k1", "k2", "k3", "k4")
+_FISHEYE = "OPENCV_FISHEYE"
 # What these names mean differs between programs by which coefficients are zero only: nerfstudio's converters
-# write any of them, and it undistorts by the coefficients that are there.
-_PERSPECTIVE_NAMES = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
-_FISHEYE_NAMES = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE")
-# The others of COLMAP, with the fields of their coefficients.
-_OTHER_NAMES = {
-    "FOV": ("FOV", ("omega",)),
-    "THIN_PRISM_FISHEYE": ("THIN_PRISM_FISHEYE", ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1")),
-    "RAD_TAN_THIN_PRISM_FISHEYE": (
-        "RAD_TAN_THIN_PRISM_FISHEYE",
-        ("k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1", "s0", "s1", "s2", "s3"),
+# write any of them, and it undistorts by the coefficients that are there. The others are COLMAP's.
+_GENERAL = {
+    **dict.fromkeys(
+        ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"), "FULL_OPENCV"
     ),
-    "DIVISION": ("DIVISION", ("k",)),
-    "SIMPLE_DIVISION": ("DIVISION", ("k",)),
-    "EUCM": ("EUCM", ("alpha", "beta")),
+    **dict.fromkeys(("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), _FISHEYE),
+    "SIMPLE_DIVISION": "DIVISION",
 }
-MODEL_NAMES = (*_PERSPECTIVE_NAMES, *_FISHEYE_NAMES, *_OTHER_NAMES)
 # Fields of a lens whatever its model; another one that is not zero is refused, as it would have no effect.
 _COEFFICIENT = re.compile(r"(?i)k\d*|p\d+|s\d+|sx\d+|sy\d+|b\d+|xi|omega|skew|ftheta_p\d+")
 # nerfstudio's list, in its order.
@@ -65,27 +54,9 @@ def read_lens(root: Fields, frame: Fields, path: Path, notes: dict[str, None]) -
     if focal is None:
         raise ValueError("neither fl_x nor camera_angle_x is given")
     centre = number(merged, "cx", width / 2), number(merged, "cy", height / 2)
-    model, names = _model(root, frame)
-    coefficients = _coefficients(merged, model, names, notes)
-    if names == _OPENCV:
-        is_pinhole = model == "PINHOLE" and not any(coefficients)
-        model, coefficients = ("PINHOLE", ()) if is_pinhole else ("FULL_OPENCV", coefficients)
-    return Lens(model, width, height, (*focal, *centre, *coefficients))
-
-
-def number(fields: Fields, key: str, default: float | None = None) -> float:
-    """Return a field that must be a finite number (as text too), or a default; ValueError names it."""
-    value = fields.get(key, default)
-    try:
-        if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-            raise ValueError
-        converted = float(value)
-    except (ValueError, OverflowError):
-        converted = math.nan
-    if not math.isfinite(converted):
-        shown = "null" if value is None else f"{value!r:.40}"
-        raise ValueError(f"{key} must be a finite number, got {shown}")
-    return converted
+    name = _model_name(root, frame)
+    model = _GENERAL.get(name, name)
+    return Lens(model, width, height, (*focal, *centre, *_coefficients(merged, name, model, notes)))
 
 
 def _size(fields: Fields, path: Path) -> tuple[int, int]:
@@ -139,7 +110,7 @@ def _focal_length(fields: Fields, axis: str, size: int, notes: dict[str, None]) 
     by_angle = None
     if angle in fields:
         radians = number(fields, angle)
-        if not 0 < radians < math.pi:
+        if not 0 < 0.5 * radians < 0.5 * math.pi:
             hint = f": as degrees it would be {math.radians(radians):.6g}" if radians > 0 else ""
             raise ValueError(
                 f"{angle} must be an angle of view in radians, above 0 and below pi, got {radians:g}{hint}"
@@ -147,7 +118,7 @@ def _focal_length(fields: Fields, axis: str, size: int, notes: dict[str, None]) 
         by_angle = 0.5 * size / math.tan(0.5 * radians)
     elif degrees in fields:  # instant-ngp's
         value = number(fields, degrees)
-        if not 0 < value < 180:
+        if not 0 < 0.5 * math.radians(value) < 0.5 * math.pi:
             raise ValueError(f"{degrees} must be an angle of view in degrees, above 0 and below 180")
         by_angle = 0.5 * size / math.tan(0.5 * math.radians(value))
     if length not in fields:
@@ -161,54 +132,50 @@ def _focal_length(fields: Fields, axis: str, size: int, notes: dict[str, None]) 
     return focal
 
 
-def _model(root: Fields, frame: Fields) -> tuple[str, tuple[str, ...]]:
-    """Return COLMAP's model and the fields of its coefficients, in order."""
-    name = "OPENCV"
+def model_names() -> list[str]:
+    """Return the values of camera_model that can be read."""
+    return [name for name in camera_models() if name != "EQUIRECTANGULAR"]
+
+
+def _model_name(root: Fields, frame: Fields) -> str:
+    """Return the camera model by COLMAP's name."""
     for level in (frame, root):  # the first that says something
         flag = level.get("is_fisheye")
         if "is_fisheye" in level and not isinstance(flag, bool):
             raise ValueError(f"is_fisheye must be true or false, got {flag!r}")
-        if "camera_model" not in level:
-            if flag is not None:
-                name = "OPENCV_FISHEYE" if flag else name
-                break
-            continue
-        given = level["camera_model"]
-        name = given.upper() if isinstance(given, str) else repr(given)
-        if name not in MODEL_NAMES and name != "EQUIRECTANGULAR":
-            raise ValueError(f"camera_model {given!r:.40} is not supported; known: {', '.join(MODEL_NAMES)}")
-        if flag is not None and flag != ("FISHEYE" in name):
-            raise ValueError(
-                f"is_fisheye is {str(flag).lower()} but camera_model is {name}: remove the one that is wrong"
-            )
-        break
-    if name == "EQUIRECTANGULAR":
-        Lens(name, 1, 1, tuple(1.0 for _ in camera_models()[name]))  # which says why it is refused
-    if name in _OTHER_NAMES:
-        return _OTHER_NAMES[name]
-    if name in _FISHEYE_NAMES:
-        return "OPENCV_FISHEYE", _FISHEYE
-    if name == "FULL_OPENCV":
-        return name, _OPENCV
-    # "OPENCV" here: nerfstudio's model of this name may have k3, which COLMAP's has not.
-    return "PINHOLE" if "PINHOLE" in name else "OPENCV", _OPENCV
+        if "camera_model" in level:
+            given = level["camera_model"]
+            name = given.upper() if isinstance(given, str) else ""
+            if name == "EQUIRECTANGULAR":
+                Lens(name, 1, 1, ())  # which says why it is refused
+            if name not in model_names():
+                raise ValueError(
+                    f"camera_model {given!r:.40} is not supported; known: {', '.join(model_names())}"
+                )
+            if flag is not None and flag != ("FISHEYE" in name):
+                raise ValueError(
+                    f"is_fisheye is {str(flag).lower()} but camera_model is {name}: remove the one that is "
+                    "wrong"
+                )
+            return name
+        if flag is not None:
+            return _FISHEYE if flag else "OPENCV"
+    return "OPENCV"
 
 
-def _coefficients(
-    fields: Fields, model: str, names: tuple[str, ...], notes: dict[str, None]
-) -> tuple[float, ...]:
-    fields = _with_listed(fields, names)
+def _coefficients(fields: Fields, name: str, model: str, notes: dict[str, None]) -> list[float]:
+    """Return the coefficients of `model`, which holds those of the lens that the fields call `name`."""
+    names = camera_models()[model][4:]
+    fields = _with_listed(fields, model)
     given = {key: number(fields, key) for key in names if key in fields}
-    # Of other names, only numbers are taken for coefficients: a file may have fields of its own.
-    others = (key for key in fields if key not in names and (key in _OPENCV or _is_coefficient(fields, key)))
-    lost = {key: value for key in sorted(others) if (value := number(fields, key)) != 0}
-    if lost:
+    others = (key for key in sorted(fields.keys() - set(names)) if _is_coefficient(key, fields[key]))
+    if lost := {key: value for key in others if (value := number(fields, key)) != 0}:
         values = ", ".join(f"{key} = {value:g}" for key, value in lost.items())
-        what = "a fisheye lens has only k1 to k4" if names == _FISHEYE else f"{model} has {', '.join(names)}"
+        what = "a fisheye lens has only k1 to k4" if model == _FISHEYE else f"{name} has {', '.join(names)}"
         raise ValueError(f"{values}: {what}; set the others to 0, or name another camera_model")
     if model == "EUCM" and (unknown := sorted(set(names) - given.keys())):
         raise ValueError(f"camera_model {model} needs {' and '.join(unknown)}")
-    if names == _OPENCV and model != "FULL_OPENCV":
+    if model == "FULL_OPENCV" and name != model:
         if given.get("k4", 0.0) != 0 and not {"k5", "k6"} & fields.keys():
             # nerfstudio multiplies by 1 + k1 r + k2 r^2 + k3 r^3 + k4 r^4 with r = x^2 + y^2.
             raise ValueError(
@@ -216,18 +183,18 @@ def _coefficients(
                 "nerfstudio's, is no lens of this package; fit the lens again without k4 or undistort the "
                 "images, or write k5 and k6 if k4 is of OpenCV's rational model"
             )
-        if model == "PINHOLE" and any(given.values()):
+        if "PINHOLE" in name and any(given.values()):
             notes["camera_model is that of a pinhole, but its coefficients are not 0 and are used"] = None
-    return tuple(given.get(key, 0.0) for key in names)
+    return [given.get(key, 0.0) for key in names]
 
 
-def _with_listed(fields: Fields, names: tuple[str, ...]) -> Fields:
+def _with_listed(fields: Fields, model: str) -> Fields:
     """Return the fields with the coefficients of nerfstudio's `distortion_params` under their names."""
     if "distortion_params" not in fields:
         return fields
     values = fields["distortion_params"]
     # Four values are k1 to k4 of a fisheye lens, but k1, k2, p1, p2 to OpenCV.
-    if not isinstance(values, list) or len(values) not in ((4, 6) if names == _FISHEYE else (6,)):
+    if not isinstance(values, list) or len(values) not in ((4, 6) if model == _FISHEYE else (6,)):
         raise ValueError(f"distortion_params must be a list of {', '.join(_LIST)}, got {values!r:.60}")
     listed = dict(zip(_LIST, values, strict=False))
     for key in listed:
@@ -237,11 +204,10 @@ def _with_listed(fields: Fields, names: tuple[str, ...]) -> Fields:
     return {**fields, **listed}
 
 
-def _is_coefficient(fields: Fields, key: str) -> bool:
-    value = fields[key]
-    return (
-        bool(_COEFFICIENT.fullmatch(key)) and isinstance(value, (int, float)) and not isinstance(value, bool)
-    )
+def _is_coefficient(key: str, value: object) -> bool:
+    """Tell whether a field is a coefficient; only numbers are: a file may have fields of its own."""
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return bool(_COEFFICIENT.fullmatch(key)) and (is_number or key in camera_models()["FULL_OPENCV"])
 
 
 def _refuse_other_projections(fields: Fields) -> None:

@@ -1,21 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which views and points of a capture are used: what cannot be is left out, some views are held out."""
+"""Which views and points of a capture are used: what cannot be is left out."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path, PurePath
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from blitzgs.capture import transforms
-from blitzgs.capture.cameras import Camera, Float64, SourceView, rectify
+from blitzgs.capture.cameras import Camera, Float64, SourceView, camera_centres, rectify
 from blitzgs.capture.layouts import read_layout
-from blitzgs.capture.lengths import StrayCamera, random_points
+from blitzgs.capture.lengths import LEAST_SPREAD, StrayCamera
 from blitzgs.capture.lens import Lens, check_lens
-from blitzgs.capture.names import read_lines
 from blitzgs.capture.points import SourcePoints
 from blitzgs.util.errors import located, warn
 
@@ -29,8 +28,12 @@ def _is_usable(coordinates: Float64) -> npt.NDArray[np.bool_]:
     return np.asarray(np.abs(coordinates) < _FARTHEST)  # false for NaN
 
 
-def with_finite_poses(views: list[SourceView]) -> list[SourceView]:
-    """Return the views whose pose is finite; warn of the others (ValueError: there is none)."""
+def usable_views(views: list[SourceView]) -> list[SourceView]:
+    """Return the views whose pose is finite, by name; warn of the others, and of lenses that are unusual.
+
+    ValueError: no pose is finite, or no camera has one of the lenses.
+    """
+    _check_lenses(views)
     finite = [view for view in views if _is_usable(view.world_to_camera).all()]
     if not finite:
         raise ValueError(f"none of the {len(views)} views has a pose (a finite rotation and translation)")
@@ -40,23 +43,20 @@ def with_finite_poses(views: list[SourceView]) -> list[SourceView]:
             f"{len(views) - len(finite)} of {len(views)} views have no finite pose and were dropped "
             f"(first: {first})"
         )
-    return finite
+    return sorted(finite, key=lambda view: view.name)
 
 
-def check_lenses(views: list[SourceView]) -> None:
-    """Refuse lenses that no camera has, and name those that are unusual."""
-    unusual: dict[Lens, str] = {}
-    checked: set[Lens] = set()
+def _check_lenses(views: list[SourceView]) -> None:
+    first: dict[Lens, str] = {}
     for view in views:
-        if view.lens in checked:
-            continue
-        checked.add(view.lens)
-        with located(f"the camera of {view.name}"):
-            doubt = check_lens(view.lens)
-        if doubt:
-            unusual[view.lens] = f"{view.name}: {doubt}"
+        first.setdefault(view.lens, view.name)
+    unusual = []
+    for lens, name in first.items():
+        with located(f"the camera of {name}"):
+            if doubt := check_lens(lens):
+                unusual.append(f"{name}: {doubt}")
     if unusual:
-        warn(f"{len(unusual)} of {len(checked)} cameras are unusual (first: {next(iter(unusual.values()))})")
+        warn(f"{len(unusual)} of {len(first)} cameras are unusual (first: {unusual[0]})")
 
 
 def without_strays(
@@ -85,13 +85,32 @@ def finite_points(points: SourcePoints) -> SourcePoints:
 
 
 def points_at_random(root: Path, cameras: Sequence[Camera], offset: Float64) -> SourcePoints:
-    """Return uniform points of random colours in the region that the cameras look at."""
+    """Return uniform points of random colours in the region that the cameras look at.
+
+    ValueError: all cameras are in one place.
+    """
     warn(
         f"{root}: the capture has no points; {_RANDOM_POINTS:,} random ones take their place. Points of the "
         "reconstruction give a better start"
     )
-    with located(str(root)):
-        return SourcePoints(*random_points(cameras, offset, _RANDOM_POINTS))
+    poses = np.stack([camera.world_to_camera for camera in cameras])
+    centres, axes = camera_centres(poses), poses[:, 2, :3]
+    # The point nearest to all optical axes by least squares; the tiny term keeps parallel axes solvable.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    target = np.linalg.solve(
+        across.sum(axis=0) + 1e-6 * np.eye(3),
+        np.einsum("nij,nj->i", across, centres) + 1e-6 * centres.mean(axis=0),
+    )
+    half = 0.35 * float(np.linalg.norm(centres - target, axis=1).mean())
+    # Files state coordinates of a map, with offsets of millions of metres, to a millimetre.
+    if half <= LEAST_SPREAD * (1 + 1e-3 * float(np.abs(offset).max())):
+        raise ValueError(
+            f"{root}: the capture has no points and all its cameras are in one place, so the position of the "
+            "scene is unknown: add points to the capture"
+        )
+    random, shape = np.random.default_rng(0), (_RANDOM_POINTS, 3)
+    positions = target + offset + random.uniform(-half, half, shape)
+    return SourcePoints(positions, random.integers(0, 256, shape, dtype=np.uint8))
 
 
 def read_cameras(path: Path, offset: Float64) -> list[Camera]:
@@ -109,117 +128,11 @@ def read_cameras(path: Path, offset: Float64) -> list[Camera]:
         raise FileNotFoundError(f"{path}: there is no such transforms file or folder of a COLMAP model")
     if not views:
         raise ValueError(f"{path} has no cameras")
-    check_lenses(views)
-    views = sorted(with_finite_poses(views), key=lambda view: view.name)
-    return [_pinhole(view, offset) for view in views]
+    return [_pinhole(view, offset) for view in usable_views(views)]
 
 
 def _pinhole(view: SourceView, offset: Float64) -> Camera:
     with located(f"the camera of {view.name}"):
         plan = rectify(view.lens, "crop")
-    pose = view.world_to_camera.copy()
-    pose[:3, 3] += pose[:3, :3] @ offset
+    pose = view.pose_from(offset)
     return Camera(view.name, plan.width, plan.height, plan.K, pose, view.path, None, 1, plan)
-
-
-DEFAULT_EVERY = 8
-
-
-def from_list(names: Sequence[str], path: Path) -> list[int]:
-    """Return the test views that a text file names, one per line, with or without folder and suffix."""
-    lookup: dict[str, set[int]] = {}
-    for index, name in enumerate(names):
-        pure = PurePath(name)
-        for key in {name, pure.name, pure.stem, str(pure.with_suffix(""))}:
-            lookup.setdefault(key, set()).add(index)
-    test: set[int] = set()
-    for number, line in enumerate(read_lines(path), start=1):
-        entry = line.split("#")[0].strip().replace("\\", "/")
-        if not entry:
-            continue
-        found = lookup.get(entry, set())
-        exact = {index for index in found if names[index] == entry}
-        found = exact or found
-        if len(found) != 1:
-            problem = f"names {len(found)} views" if found else "names no view of the capture"
-            raise ValueError(
-                f"{path}: line {number}: '{entry}' {problem} (views are called like '{names[0]}')"
-            )
-        test |= found
-    if not test:
-        raise ValueError(f"{path} names no view: list the held-out ones, or set --data.split=0 for none")
-    return sorted(test)
-
-
-def is_val(name: str, image_path: Path, root: Path) -> bool:
-    """Tell whether an image is in Mega-NeRF's `val/` folder of the capture."""
-    inside = image_path.relative_to(root) if image_path.is_relative_to(root) else PurePath(name)
-    return ("val",) in (inside.parts[:1], PurePath(name).parts[:1])
-
-
-def split_views(
-    names: Sequence[str], paths: Sequence[Path], root: Path, spec: int | str | Path = "auto"
-) -> tuple[list[int], list[int]]:
-    """Return train and test views, both ascending.
-
-    `spec` is n (every n-th), "val" (Mega-NeRF's layout), a list file (relative to `root` or as it is), or
-    "auto": "val" if such a folder has views, else every 8th. ValueError: the list names unknown views, or no
-    training view is left.
-    """
-    given, in_val = spec, [i for i in range(len(names)) if is_val(names[i], paths[i], root)]
-    if isinstance(spec, str) and spec.removeprefix("-").isdigit():
-        spec = int(spec)
-    if spec == "auto" and not in_val:
-        spec = DEFAULT_EVERY if len(names) > 1 else 0
-    if isinstance(spec, int):
-        if spec < 0 or spec == 1:
-            raise ValueError(f"data.split: must be 0 (no view is held out) or at least 2, got {spec}")
-        test = list(range(0, len(names), spec)) if spec else []
-    elif spec in ("auto", "val"):
-        test = in_val
-        if not test:
-            raise ValueError(f"split 'val': no view's image is in {root / 'val'}")
-    else:
-        found = next((path for path in (root / spec, Path(spec)) if path.is_file()), None)
-        if found is None:
-            raise ValueError(
-                f"split '{spec}': must be a whole number n (every n-th view is held out; 0: none), "
-                f"'auto', 'val' or a file in {root}"
-            )
-        test = from_list(names, found)
-    train = sorted(set(range(len(names))).difference(test))
-    if not train:
-        raise ValueError(f"split '{given}' leaves no training view of {len(names)}")
-    return train, test
-
-
-def without_unused(views: list[SourceView], spec: int | str | Path) -> list[SourceView]:
-    """Return the views without those that the capture's own lists leave out, if these decide."""
-    if spec != "auto":
-        return views
-    both = [view.name for view in views if view.part == "both"]
-    if both:
-        raise ValueError(
-            f"{len(both)} views are in train_filenames and also in val_filenames or test_filenames (first: "
-            f"{both[0]}): a view that is trained on cannot measure the result; remove them from one of the "
-            "lists, or choose the held-out views with --data.split"
-        )
-    return [view for view in views if view.part != "unused"]
-
-
-def split_capture(
-    views: Sequence[SourceView], root: Path, spec: int | str | Path
-) -> tuple[list[int], list[int], str]:
-    """Return train and test views, both ascending, and what decided on them; see `split_views`."""
-    if spec == "auto" and any(view.part is not None for view in views):
-        test = [i for i, view in enumerate(views) if view.part == "test"]
-        train = [i for i, view in enumerate(views) if view.part != "test"]
-        if not train:
-            raise ValueError(f"{root}: the files hold out every view: no training view is left")
-        return train, test, "the capture's own split"
-    names, paths = [view.name for view in views], [view.path for view in views]
-    train, test = split_views(names, paths, root, spec)
-    if spec != "auto":
-        return train, test, f"data.split={spec}"
-    in_val = bool(test) and is_val(names[test[0]], paths[test[0]], root)
-    return train, test, "the images in val/" if in_val else f"every {DEFAULT_EVERY}th view by name"

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from blitzgs.capture.cameras import Float64
+from blitzgs.capture.fields import read_small
 from blitzgs.util.errors import optional_package
 
 # The file of a run, and of a capture whose world its own files do not say.
@@ -24,7 +25,6 @@ GEO = "geo.json"
 GEOCENTRIC = "EPSG:4978"
 # The smaller spread of points, as a share of the larger, from which a similarity has no free turn left.
 _LEAST_WIDTH = 1e-3
-_MAX_BYTES = 1 << 20
 # WGS 84: the major axis in metres, and the square of the eccentricity.
 _AXIS, _E2 = 6378137.0, (2 - 1 / 298.257223563) / 298.257223563
 
@@ -75,14 +75,8 @@ class WorldFrame:
 
     def as_json(self) -> dict[str, Any]:
         """Return the content of the file `geo.json`."""
-        return {
-            "meaning": "world = scale * rotation @ capture + translation",
-            "crs": self.crs,
-            "scale": float(self.scale),
-            "rotation": np.asarray(self.rotation).tolist(),
-            "translation": np.asarray(self.translation).tolist(),
-            "source": self.source,
-        }
+        arrays = {name: np.asarray(getattr(self, name)).tolist() for name in ("rotation", "translation")}
+        return {"meaning": "world = scale * rotation @ capture + translation", **vars(self), **arrays}
 
 
 def fit_similarity(capture: Float64, world: Float64, crs: str = "", source: str = "") -> WorldFrame:
@@ -123,15 +117,6 @@ def read_world_frame(path: Path) -> WorldFrame:
         return WorldFrame(crs, float(scale), rotation, translation, str(path.name))
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path} is damaged ({error}): write it again with blitzgs align") from error
-
-
-def read_small(path: Path) -> str:
-    """Return the text of a file of at most a megabyte."""
-    with open(path, "rb") as file:
-        content = file.read(_MAX_BYTES + 1)
-    if len(content) > _MAX_BYTES:
-        raise ValueError(f"{path} is larger than {_MAX_BYTES:,} bytes, which such a file never is")
-    return content.decode("utf-8-sig", errors="replace")
 
 
 def frame_beside(root: Path) -> WorldFrame | None:
@@ -195,14 +180,9 @@ def geodetic(position: Float64) -> tuple[float, float, float]:
     return math.degrees(latitude), math.degrees(math.atan2(y, x)), height
 
 
-def pyproj_module() -> Any:
-    """Return the package pyproj, which knows the reference systems (ImportError: it is not installed)."""
-    return optional_package("pyproj", "geo", "this")
-
-
 def reference_system(crs: str) -> Any:
     """Return a reference system by its name (ImportError: pyproj is missing; ValueError: it is unknown)."""
-    pyproj = pyproj_module()
+    pyproj = optional_package("pyproj", "geo", "this")
     try:
         return pyproj.CRS.from_user_input(crs)
     except pyproj.exceptions.CRSError as error:
@@ -215,7 +195,7 @@ def converted(positions: Float64, source: Any, target: Any) -> Float64:
     ImportError: pyproj is not installed. ValueError: a system is unknown, or a position has no coordinates in
     it.
     """
-    pyproj = pyproj_module()
+    pyproj = optional_package("pyproj", "geo", "this")
     try:
         transformer = pyproj.Transformer.from_crs(source, target, always_xy=True)
         moved = np.stack(transformer.transform(*positions.T, errcheck=True), axis=1)

@@ -132,11 +132,11 @@ def run_stage(stage: str, job: Job, log: Path, lock: int, report: Report) -> Non
     program = backend()
     Path(job.models).mkdir(parents=True, exist_ok=True)
     if program == "pycolmap":
-        run_pycolmap(stage, asdict(job), log, lock, lambda line: _progress(line, len(job.names), report))
+        run_pycolmap(stage, asdict(job), log, lock, report, len(job.names))
         return
     for command in _commands(program, stage, job):
         try:
-            _run(command, log, lock, lambda line: _progress(line, len(job.names), report))
+            _run(command, log, lock, report, len(job.names))
         except StageError as error:
             if "bundle_adjuster" not in command:
                 raise
@@ -146,14 +146,16 @@ def run_stage(stage: str, job: Job, log: Path, lock: int, report: Report) -> Non
             )
 
 
-def run_pycolmap(stage: str, job: dict[str, Any], log: Path, lock: int, heard: Callable[[str], None]) -> None:
-    """Do a stage of `blitzgs.sfm.pycolmap_stage`, as `run_stage`; `heard` gets each line that COLMAP says."""
+def run_pycolmap(
+    stage: str, job: dict[str, Any], log: Path, lock: int, report: Report, photographs: int | None = None
+) -> None:
+    """Do a stage of `blitzgs.sfm.pycolmap_stage`; `report` gets its rounds if it knows no `photographs`."""
     file = log.with_name("job.json")  # thousands of names are too long for an argument
     file.write_text(json.dumps({"stage": stage, **job}))
-    _run([sys.executable, "-m", "blitzgs.sfm.pycolmap_stage", str(file)], log, lock, heard)
+    _run([sys.executable, "-m", "blitzgs.sfm.pycolmap_stage", str(file)], log, lock, report, photographs)
 
 
-def _run(command: list[str], log: Path, lock: int, heard: Callable[[str], None]) -> None:
+def _run(command: list[str], log: Path, lock: int, report: Report, photographs: int | None = None) -> None:
     last = ""
     with (
         log.open("a", buffering=1, encoding="utf-8") as file,
@@ -171,7 +173,7 @@ def _run(command: list[str], log: Path, lock: int, heard: Callable[[str], None])
             for line in process.stdout:
                 file.write(line)
                 last = line.strip() or last
-                heard(line)
+                _progress(line, photographs, report)
         except BaseException:
             process.kill()
             raise
@@ -185,12 +187,13 @@ def _run(command: list[str], log: Path, lock: int, heard: Callable[[str], None])
         raise StageError(f"COLMAP ended with {how}{why}: {last} ({log} has all that it said)")
 
 
-def _progress(line: str, photographs: int, report: Report) -> None:
-    if found := _POSES.search(line):
+def _progress(line: str, photographs: int | None, report: Report) -> None:
+    if photographs is not None and (found := _POSES.search(line)):
         report(int(found[1]), photographs)
     elif found := _STEP.search(line):
         done, total, inner, inners = (int(number or 1) for number in found.groups())
-        report(photographs * ((done - 1) * inners + inner) // (total * inners), photographs)
+        whole = photographs or total
+        report(whole * ((done - 1) * inners + inner) // (total * inners), whole)
 
 
 def _commands(program: str, stage: str, job: Job) -> Iterator[list[str]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 
 from blitzgs.capture.colmap import Float64, find_incomplete_model, find_models
-from blitzgs.capture.image_files import decode_mask, read_header, read_whole
+from blitzgs.capture.image_files import decode_mask, in_threads, read_header, read_whole
 from blitzgs.capture.masks import damaged, find_masks
-from blitzgs.capture.names import IMAGE_SUFFIXES, files_below, to_convert
+from blitzgs.capture.names import BY_PRODUCTS, IMAGE_SUFFIXES, files_below, to_convert
 from blitzgs.capture.projects.find import find_project
 from blitzgs.capture.transforms import find_transforms
 from blitzgs.sfm.engine import MOST_IN_ALL_PAIRS
@@ -23,9 +23,7 @@ from blitzgs.util.errors import warn
 from blitzgs.util.output import write_file
 
 # Files and folders of what programs write beside photographs.
-_BY_PRODUCT = re.compile(
-    r"(?i)(^|/)(depth|normal|disp|mask|alpha|segmentation|semantic)s?(_?\d+)?[./]|_mask\.|\.mask\."
-)
+_BY_PRODUCT = re.compile(rf"(?i)(^|/)({BY_PRODUCTS})s?(_?\d+)?[./]|_mask\.|\.mask\.")
 # A place by GPS is right to some metres: photographs within fewer metres say nothing of each other.
 _LEAST_SPREAD = 30.0
 _METRES_PER_DEGREE = 111_000.0
@@ -36,9 +34,9 @@ def photograph_folder(root: Path, images: str = "images") -> Path:
     return root / images if (root / images).is_dir() else root
 
 
-def find_photographs(folder: Path) -> list[str]:
-    """Return the photographs below a folder, sorted, as paths relative to it; by-products are left out."""
-    found = (name for name in files_below(folder) if PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES)
+def _photographs_of(files: Iterable[str]) -> list[str]:
+    """Return the photographs among files; by-products are left out."""
+    found = (name for name in files if name.lower().endswith(IMAGE_SUFFIXES))
     return [name for name in found if not _BY_PRODUCT.search(name)]
 
 
@@ -47,13 +45,13 @@ def has_photographs_alone(root: Path, images: str) -> bool:
 
     ValueError: it has several projects of other programs.
     """
-    if not root.is_dir() or find_models(root) or find_incomplete_model(root) or find_transforms(root):
+    if not root.is_dir() or find_incomplete_model(root) or find_transforms(root):
         return False
-    posed = any(find_models(root / part) for part in ("train", "val")) or any(
-        any(root.rglob(f"cameras{end}")) for end in (".bin", ".txt")
-    )
-    alone = not posed and find_project(root) is None
-    return alone and bool(find_photographs(photograph_folder(root, images)))
+    # Models anywhere below; behind links only where a capture has them.
+    models = any(any(root.rglob(f"cameras{suffix}")) for suffix in (".bin", ".txt"))
+    if models or any(find_models(root / part) for part in ("", "train", "val")) or find_project(root):
+        return False
+    return bool(_photographs_of(files_below(photograph_folder(root, images))))
 
 
 @dataclass(frozen=True)
@@ -73,8 +71,8 @@ class Photographs:
         FileNotFoundError: there are none. ValueError: fewer than three can be used, or masks belong to none
         of them.
         """
-        names = find_photographs(folder) if folder.is_dir() else []
-        files = list(files_below(folder)) if folder.is_dir() else [folder.name]
+        files = files_below(folder) if folder.is_dir() else [folder.name]
+        names = _photographs_of(files) if folder.is_dir() else []
         # Many cameras write a photograph as JPEG and as raw data beside it.
         known = {PurePosixPath(name).with_suffix("") for name in names}
         others = to_convert(name for name in files if PurePosixPath(name).with_suffix("") not in known)
@@ -90,7 +88,7 @@ class Photographs:
         if len(sound) < 3:
             why = f"; {next(iter(problems.values()))}" if problems else ""
             raise ValueError(f"{folder}: 3 photographs are needed, {len(sound)} can be used{why}")
-        headers = [read_header(folder / names[i]) for i in sound]
+        headers = in_threads(read_header, [folder / names[i] for i in sound])
         return cls(
             folder,
             [names[i] for i in sound],

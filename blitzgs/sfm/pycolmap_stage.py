@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from blitzgs.capture.colmap import Float64
-from blitzgs.sfm.engine import MANY, adopt, least_model, lens_model
+from blitzgs.sfm.engine import MANY, adopt, camera_of, least_model, lens_model
 
 # The standard deviations of a position by GPS in metres, across and up; the second of an altitude that says
 # nothing. Drones state altitudes by barometer, which drift between flights.
@@ -55,10 +54,8 @@ def features(job: dict[str, Any]) -> None:
         options.camera_model = lens_model(job["camera_model"], len(names))
         if job["masks"]:
             options.mask_path = job["masks"]
-        with pycolmap.Database.open(job["database"]) as database:
-            before = (database.read_image_with_name(name) for name in names)
-            if (image := next(filter(None, before), None)) is not None:  # of an interrupted stage
-                options.existing_camera_id = image.camera_id
+        if (camera_id := camera_of(Path(job["database"]), names)) is not None:
+            options.existing_camera_id = camera_id
         pycolmap.extract_features(
             job["database"], photos, names, pycolmap.CameraMode.SINGLE, reader_options=options
         )
@@ -155,7 +152,11 @@ def _all_at_once(job: dict[str, Any], gpu: bool) -> dict[int, Any]:
         # The global mapper knows no priors: its result is moved, turned and scaled to them.
         names = [image.name for image in model.images.values() if image.name in known]
         if len(names) >= 3:
-            _place(model, names, np.stack([known[name] for name in names]))
+            places, robust = np.stack([known[name] for name in names]), pycolmap.RANSACOptions()
+            robust.max_error = 5 * _ACROSS
+            moved = pycolmap.align_reconstruction_to_locations(model, names, places, 3, robust)
+            if moved is not None:
+                model.transform(moved)
             model.write(Path(job["models"]) / str(number))
     return dict(models)
 
@@ -188,13 +189,6 @@ def _centre_lenses(database: str, folder: Path, options: Any) -> None:
     (refined := folder.with_name("refined")).mkdir(exist_ok=True)
     model.write(refined)
     adopt(refined, folder)
-
-
-def _place(model: Any, names: list[str], positions: Float64) -> None:
-    robust = pycolmap.RANSACOptions(max_error=5 * _ACROSS)
-    moved = pycolmap.align_reconstruction_to_locations(model, names, positions, 3, robust)
-    if moved is not None:
-        model.transform(moved)
 
 
 def refine(job: dict[str, Any]) -> None:

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from blitzgs.capture.colmap import FILES, count_images
-from blitzgs.capture.world import GEO, enu_frame, read_small
+from blitzgs.capture.fields import read_small
+from blitzgs.capture.world import GEO, enu_frame
 from blitzgs.sfm.engine import (
     STAGES,
     Job,

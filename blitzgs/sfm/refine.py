@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -25,7 +24,7 @@ from blitzgs.capture.colmap import (
 from blitzgs.capture.names import IMAGE_SUFFIXES
 from blitzgs.sfm.engine import has_pycolmap, run_pycolmap
 from blitzgs.sfm.reconstruct import WORK, at_work
-from blitzgs.sfm.report import misses
+from blitzgs.sfm.report import distances, misses
 from blitzgs.util.errors import warn
 from blitzgs.util.output import check_outside
 from blitzgs.util.progress import image_progress
@@ -86,8 +85,9 @@ def refine(root: Path, capture: Path) -> Refined:
     if not any(path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES for path in others):
         raise ValueError(f"{root} has no photographs beside its model: name the folder of the capture")
     model = read_model(folder, points2d=True)
-    missed = _distances(model)
-    if not (~np.isnan(missed)).any():
+    missed = distances(model)
+    every = np.concatenate([*missed.values(), []])
+    if np.isnan(every).all():
         raise ValueError(
             f"{folder} does not say at which pixels photographs saw its points, which tell lens and poses: "
             "blitzgs sfm finds poses of the photographs anew"
@@ -107,13 +107,8 @@ def refine(root: Path, capture: Path) -> Refined:
     work.mkdir(parents=True, exist_ok=True)
     with at_work(work) as lock, image_progress("poses", unit="rounds") as report:
         (found := work / "models").mkdir(exist_ok=True)
-        job = {"model": str(folder.absolute()), "refined": str(found), "miss": float(np.nanmedian(missed))}
-
-        def heard(line: str) -> None:
-            if round_of := re.match(r"\[(\d+)/(\d+)\]$", line):
-                report(int(round_of[1]), int(round_of[2]))
-
-        run_pycolmap("refine", job, work / "colmap.log", lock, heard)
+        job = {"model": str(folder.absolute()), "refined": str(found), "miss": float(np.nanmedian(every))}
+        run_pycolmap("refine", job, work / "colmap.log", lock, report)
     refined = _compare(model, missed, read_model(found, points2d=True))
     source = found if refined.adopted else folder
     shutil.rmtree(sparse := work / "sparse", ignore_errors=True)
@@ -152,35 +147,26 @@ def fit_of(model: Path) -> str | None:
     return f"miss their points by {median:.2f} pixels (median), by {lens:.2f} because of the lens{advice}"
 
 
-def _distances(model: ColmapModel) -> Float64:
-    """Return the misses as distances [O]."""
-    return np.linalg.norm(misses(model), axis=1)
-
-
-def _compare(old: ColmapModel, missed: Float64, new: ColmapModel) -> Refined:
-    was, now = _by_name(old, missed), _by_name(new, _distances(new))
-    both = {name: ~np.isnan(was[name][0]) & ~np.isnan(now[name][0]) for name in was}
+def _compare(old: ColmapModel, was: dict[str, Float64], new: ColmapModel) -> Refined:
+    now, lenses = distances(new), {camera.id: _lens(camera) for camera in new.cameras}
+    both = {name: ~np.isnan(was[name]) & ~np.isnan(now[name]) for name in was}
     before, after = (
-        float(np.median(np.concatenate([side[name][0][both[name]] for name in was]))) for side in (was, now)
+        float(np.median(np.concatenate([side[name][both[name]] for name in was]))) for side in (was, now)
     )
     kept = sum(int(rows.sum()) for rows in both.values())
-    lenses = {camera.id: _lens(camera) for camera in new.cameras}
+    from_place, to_place = (
+        dict(zip(model.images.names, camera_centres(world_to_camera(model.images)), strict=True))
+        for model in (old, new)
+    )
     return Refined(
         before=before,
         after=after,
         observations=kept,
-        left_out=int((~np.isnan(missed)).sum()) - kept,
+        left_out=sum(int((~np.isnan(missed)).sum()) for missed in was.values()) - kept,
         lenses=[(_lens(camera), lenses[camera.id]) for camera in old.cameras],
-        moved=float(np.median([np.linalg.norm(was[name][1] - now[name][1]) for name in was])),
+        moved=float(np.median([np.linalg.norm(from_place[name] - to_place[name]) for name in was])),
         adopted=after < _BETTER * before,
     )
-
-
-def _by_name(model: ColmapModel, distances: Float64) -> dict[str, tuple[Float64, Float64]]:
-    """Return the misses and the place of each photograph."""
-    parts = np.split(distances, model.images.point2d_offsets[1:-1].tolist())
-    centres = camera_centres(world_to_camera(model.images))
-    return dict(zip(model.images.names, zip(parts, centres, strict=True), strict=True))
 
 
 def _lens(camera: ColmapCamera) -> str:

@@ -14,13 +14,13 @@ import numpy.typing as npt
 
 from blitzgs.capture.cameras import SourceView, camera_centres
 from blitzgs.capture.colmap import ColmapModel, Float64, count_images, read_model, world_to_camera
+from blitzgs.capture.image_files import UInt8
 from blitzgs.capture.lengths import find_apart
 from blitzgs.capture.lens import lenses_of
 from blitzgs.sfm.engine import Found, Job, read_found, read_positions
 from blitzgs.sfm.photographs import Photographs
 from blitzgs.util.output import write_file
 
-UInt8 = npt.NDArray[np.uint8]
 # A photograph with fewer points is held weakly. One whose error is so many times the median is doubtful.
 _FEW_POINTS, _FEW_FEATURES, _DOUBTFUL = 50, 100, 3.0
 # A warning is given if a smaller share has a pose, or the mean error is larger, in pixels.
@@ -89,7 +89,9 @@ def examine(
         SourceView(name, photographs.folder / name, None, lenses[camera], pose)
         for name, camera, pose in zip(names, model.images.camera_ids.tolist(), poses, strict=True)
     ]
-    errors, points = _errors(model)
+    seen = {name: missed[~np.isnan(missed)] for name, missed in distances(model).items()}
+    points = {name: len(missed) for name, missed in seen.items()}
+    errors = {name: float(missed.mean()) if len(missed) else 0.0 for name, missed in seen.items()}
     doubtful = {
         s.name: f"lies at {s.distance:.6g} from the middle, the others within {s.others:.6g}"
         for s in find_apart(views, model.points.positions)[1]
@@ -147,17 +149,11 @@ def misses(model: ColmapModel) -> Float64:
     return found
 
 
-def _errors(model: ColmapModel) -> tuple[dict[str, float], dict[str, int]]:
-    """Return the mean of each photograph's misses, in pixels, and their number."""
-    errors, counts = {}, {}
-    distances = np.linalg.norm(misses(model), axis=1)
-    for name, missed in zip(
-        model.images.names, np.split(distances, model.images.point2d_offsets[1:-1].tolist()), strict=True
-    ):
-        seen = missed[~np.isnan(missed)]
-        counts[name] = len(seen)
-        errors[name] = float(seen.mean()) if len(seen) else 0.0
-    return errors, counts
+def distances(model: ColmapModel) -> dict[str, Float64]:
+    """Return the lengths of each photograph's misses, by its name."""
+    lengths = np.linalg.norm(misses(model), axis=1)
+    parts = np.split(lengths, model.images.point2d_offsets[1:-1].tolist())
+    return dict(zip(model.images.names, parts, strict=True))
 
 
 def _reason(found: Found, part: int) -> str:

@@ -5,11 +5,14 @@ import json
 import os
 import struct
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import plyfile
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -25,6 +28,12 @@ def shared_data() -> Path | None:
     """Folder of the real captures: BLITZGS_SHARED_DATA, or shared/data beside the repository."""
     candidates = [os.environ.get("BLITZGS_SHARED_DATA", ""), ROOT.parent / "shared" / "data"]
     return next((Path(p) for p in candidates if p and Path(p).is_dir()), None)
+
+
+def warned(text: str, call: Callable, /, *given: object, **named: object) -> Any:
+    """Check that a call warns with a text that the regular expression matches; return its result."""
+    with pytest.warns(UserWarning, match=text):
+        return call(*given, **named)
 
 
 def smooth_image(height: int, width: int, seed: int = 0) -> np.ndarray:
@@ -70,6 +79,40 @@ def write_capture(root: Path, names: list[str], width: int = 64, height: int = 4
     for seed, name in enumerate(names):
         write_image(root / "images" / name, smooth_image(height, width, seed))
     return root
+
+
+def frame(name: str, pose: np.ndarray | None = None, **fields: object) -> dict:
+    """A frame of transforms.json; its pose is the identity by default."""
+    return {"file_path": name, "transform_matrix": (np.eye(4) if pose is None else pose).tolist(), **fields}
+
+
+def at(*place: float) -> np.ndarray:
+    """The pose [4, 4] of a frame of transforms.json that looks along -z from a place."""
+    pose = np.eye(4)
+    pose[:3, 3] = place
+    return pose
+
+
+def write_transforms(root: Path, frames: list, file: str = "transforms.json", **fields: object) -> Path:
+    """Write frames, and fields of the root."""
+    root.mkdir(parents=True, exist_ok=True)
+    (root / file).write_text(json.dumps({**fields, "frames": frames}))
+    return root / file
+
+
+RGB = ("red", "green", "blue")
+
+
+def write_ply(path: Path, positions, values=None, names=RGB, kind: str = "u1", axes: str = "xyz") -> Path:
+    """Write points, and columns of numbers of this kind [N, len(names)] if there are some."""
+    columns = [(axis, "f8") for axis in axes] + [(name, kind) for name in names if values is not None]
+    rows = np.zeros(len(positions), columns)
+    table = positions if values is None else np.hstack([positions, values])
+    for (name, _), column in zip(columns, np.transpose(table), strict=True):
+        rows[name] = column
+    path.parent.mkdir(parents=True, exist_ok=True)
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(path)
+    return path
 
 
 def as_text(folder: Path) -> None:

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of kinds that are not supported, and damage that is found before a file is needed."""
 
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -16,11 +18,12 @@ from blitzgs.capture.image_files import (
     read_whole,
 )
 from blitzgs.capture.images import ImageStore
-from blitzgs.capture.masks import read_mask_file
-from tests.capture.helpers import smooth_image, tiff, write_capture, write_image
+from blitzgs.capture.masks import damaged
+from tests.capture.helpers import edit_model, smooth_image, tiff, warned, write_capture, write_image
 from tests.helpers import refused
 
 NAMES = [f"{i}.png" for i in range(9)]
+DIAGONAL = np.repeat(255 * np.eye(48, 64, dtype=np.uint8)[..., None], 3, axis=2)  # of a mask
 BOX = b"\0\0\0\x20ftyp%s\0\0\0\0mif1" + bytes(20)
 
 
@@ -61,11 +64,8 @@ KINDS = [
 @pytest.mark.parametrize(("name", "data", "kind"), KINDS)
 def test_what_is_not_supported_is_called_so_at_load(tmp_path, name, data, kind, capfd):
     root = write_capture(tmp_path, ["a.png"])
-    (root / "images" / "a.png").unlink()
-    (root / "images" / name).write_bytes(data)
-    (root / "sparse" / "0" / "images.bin").write_bytes(
-        (root / "sparse" / "0" / "images.bin").read_bytes().replace(b"a.png", name.encode())
-    )
+    (root / "images" / "a.png").rename(root / "images" / name).write_bytes(data)
+    edit_model(root, lambda model: model.images.names.__setitem__(0, name))
     with pytest.raises(ValueError, match=rf"{name}: .*not supported: {kind}.*convert") as caught:
         load_capture(root)
     assert "damaged" not in str(caught.value)
@@ -82,8 +82,10 @@ def test_what_is_not_supported_is_called_so_at_load(tmp_path, name, data, kind, 
 def test_files_without_an_image_are_called_what_they_are(tmp_path, data, message):
     for name in ("a.png", "a.jpg", "a.tif"):
         (tmp_path / name).write_bytes(data)
-        for reads in (read_header, check_photograph, read_mask_file):
+        for reads in (read_header, check_photograph):
             refused(ValueError, f"{name}: {message}", reads, tmp_path / name)
+        write_image(whole := tmp_path / "whole.png", smooth_image(8, 8))
+        assert re.search(f"the mask: .*{name}: {message}", damaged([(whole, tmp_path / name)])[0])
 
 
 def test_a_mask_in_separate_bands_of_16_bits_is_refused():
@@ -138,9 +140,7 @@ def spoil(path):
 def test_damage_is_found_in_the_background_and_ends_every_read(tmp_path, kind, index):
     root = write_capture(tmp_path, NAMES)
     for name in NAMES:
-        write_image(
-            root / "masks" / name, np.eye(48, 64, dtype=np.uint8)[..., None] * np.full(3, 255, np.uint8)
-        )
+        write_image(root / "masks" / name, DIAGONAL)
     capture = load_capture(root)
     store = ImageStore(capture)
     store.check_files(range(9)).wait()
@@ -150,12 +150,10 @@ def test_damage_is_found_in_the_background_and_ends_every_read(tmp_path, kind, i
     store.close()
     store = ImageStore(capture)  # which has no copy of the file in memory
     store.check_files(range(9)).wait()
-    refused(ValueError, ("the mask " if kind == "mask" else "") + rf".*{index}.png: at byte", store.get, 7)
+    refused(ValueError, ("the mask: " if kind == "mask" else "") + rf".*{index}.png: at byte", store.get, 7)
     store.close()
-    with pytest.warns(
-        UserWarning, match=rf"1 of 9 images or their masks are damaged; dropped .*{index}.png: at"
-    ):
-        left = load_capture(root, allow_missing=True)
+    message = rf"1 of 9 images or their masks are damaged; dropped .*{index}.png: at"
+    left = warned(message, load_capture, root, allow_missing=True)
     assert len(left.cameras) == 8 and left.about.damaged == 1
     np.testing.assert_array_equal(left.offset, capture.offset)
 
@@ -166,13 +164,12 @@ def test_photographs_without_a_pixel_that_counts_are_named(tmp_path, kind):
     if kind == "transparent":
         cv2.imwrite(str(root / "images" / NAMES[2]), np.zeros((48, 64, 4), dtype=np.uint8))
     else:
-        write_image(
-            root / "masks" / NAMES[1], np.eye(48, 64, dtype=np.uint8)[..., None] * np.full(3, 255, np.uint8)
-        )
+        write_image(root / "masks" / NAMES[1], DIAGONAL)
         write_image(root / "masks" / NAMES[2], np.zeros((48, 64, 3), dtype=np.uint8))
     store = ImageStore(load_capture(root))
-    with pytest.warns(UserWarning, match="1 photographs have no pixel that counts.*first: 2.png"):
-        store.check_files(range(4)).wait()
+    warned(
+        "1 photographs have no pixel that counts.*first: 2.png", lambda: store.check_files(range(4)).wait()
+    )
 
 
 def test_a_header_beyond_the_first_bytes_is_found(tmp_path):

@@ -184,26 +184,18 @@ def test_truncated_jpegs_are_named_and_never_shown_in_part(capture, kept):
     assert store.get(3).shape == (48, 64, 3)
 
 
-def lose(data, begin, end):
-    return data[:begin] + data[end:]
+HARMS = {"lost": lambda size: b"", "zeros": bytes, "others": np.random.default_rng(0).bytes}
 
 
-def zero(data, begin, end):
-    return data[:begin] + bytes(end - begin) + data[end:]
-
-
-def scramble(data, begin, end):
-    return data[:begin] + np.random.default_rng(0).bytes(end - begin) + data[end:]
-
-
-@pytest.mark.parametrize("harm", [lose, zero, scramble])
+@pytest.mark.parametrize("harm", HARMS)
 @pytest.mark.parametrize(("begin", "end"), [(0.4, 0.6), (0.8, 0.9), (0.5, 1.0)])
 def test_jpegs_with_lost_or_overwritten_blocks_are_refused(tmp_path, harm, begin, end):
     write_capture(tmp_path, NAMES[:1], width=320, height=240)
     capture = load_capture(tmp_path)
     path = capture.cameras[0].image_path
     data = path.read_bytes()
-    path.write_bytes(harm(data, int(begin * len(data)), int(end * len(data))))
+    begin, end = int(begin * len(data)), int(end * len(data))
+    path.write_bytes(data[:begin] + HARMS[harm](end - begin) + data[end:])
     refused(ValueError, rf"{NAMES[0]}: at byte \d+: .*(truncated|damaged)", ImageStore(capture).get, 0)
 
 

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Captures are found in each layout on disk, cameras without photographs too."""
 
-import json
 import math
 import shutil
 
@@ -12,7 +11,17 @@ import pytest
 from blitzgs.capture.capture import MissingImagesError, load_capture
 from blitzgs.capture.images import ImageStore
 from blitzgs.capture.usable import read_cameras
-from tests.capture.helpers import edit_model, smooth_image, write_capture, write_image
+from tests.capture.helpers import (
+    at,
+    edit_model,
+    frame,
+    smooth_image,
+    warned,
+    write_capture,
+    write_image,
+    write_ply,
+    write_transforms,
+)
 from tests.helpers import refused
 from tests.training.tiny import tiny_scene, write_tiny_capture
 
@@ -41,9 +50,7 @@ def test_nothing_to_load_is_said_clearly(tmp_path):
     (tmp_path / "transforms.json").write_text('{"frames": []}')
     with pytest.raises(ValueError, match=f"{tmp_path}: its COLMAP model or transforms.json lists no images"):
         load_capture(tmp_path)
-    pose = np.eye(4).tolist()
-    frame = {"file_path": "gone.png", "camera_angle_x": 1.0, "transform_matrix": pose}
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    write_transforms(tmp_path, [frame("gone.png", camera_angle_x=1.0)])
     refused(ValueError, "transforms.json: frame 0: .*gone.png does not exist", load_capture, tmp_path)
     (tmp_path / "transforms.json").unlink()
     write_capture(tmp_path, NAMES[:2])
@@ -89,14 +96,10 @@ def test_blender_transforms(tmp_path):
         alpha[5:10, 5:10] = (10, 20, 30, 255)
         (tmp_path / "train").mkdir(exist_ok=True)
         cv2.imwrite(str(tmp_path / "train" / f"r_{i}.png"), alpha)
-        matrix = np.eye(4)
-        matrix[:3, 3] = [i, 0, 4]
-        frames.append({"file_path": f"./train/r_{i}", "transform_matrix": matrix.tolist()})
-    content = {"camera_angle_x": 0.8, "frames": frames[:2]}
-    (tmp_path / "transforms_train.json").write_text(json.dumps(content))
-    (tmp_path / "transforms_test.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames[2:]}))
-    with pytest.warns(UserWarning, match="no points"):
-        capture = load_capture(tmp_path)
+        frames.append(frame(f"./train/r_{i}", at(i, 0, 4)))
+    for part, own in (("train", frames[:2]), ("test", frames[2:])):
+        write_transforms(tmp_path, own, f"transforms_{part}.json", camera_angle_x=0.8)
+    capture = warned("no points", load_capture, tmp_path)
     assert (capture.train, capture.test, capture.has_alpha) == ([0, 1], [2], True)
     camera = capture.cameras[0]
     assert camera.K[0, 0] == pytest.approx(15 / np.tan(0.4)) and camera.K[0, 2] == 15
@@ -116,21 +119,19 @@ def test_blender_transforms(tmp_path):
         ({"w": math.inf, "h": 48}, "frame 0: w must be a finite number, got inf"),
         ({"w": 0, "h": 0}, "frame 0: the image's size must be at least 1 x 1 in whole pixels, got w = 0"),
         ({"fl_x": 10**400}, "frame 0: fl_x must be a finite number, got 10000"),
-        ({"file_path": ""}, "frame 0: file_path must name an image, got ''"),
-        ({"file_path": None}, "frame 0: file_path must name an image, got None"),
+        ({"file_path": ""}, "frame 0: file_path must name a file, got ''"),
+        ({"file_path": None}, "frame 0: file_path must name a file, got None"),
         ({"ply_file_path": None}, "ply_file_path must name a file, got None"),
         ({"ply_file_path": ""}, "ply_file_path must name a file, got ''"),
-        ({"mask_path": 3}, "frame 0: mask_path must name an image or be null, got 3"),
-        ({"mask_path": ""}, "frame 0: mask_path must name an image or be null, got ''"),
+        ({"mask_path": 3}, "frame 0: mask_path must name a file, got 3"),
+        ({"mask_path": ""}, "frame 0: mask_path must name a file, got ''"),
         ({"is_fisheye": True, "camera_model": "OPENCV"}, "frame 0: is_fisheye is true but camera_model is"),
         ({"k1": 1e300}, "the camera of .*a.png: the lens does not see along its own axis"),
     ],
 )
 def test_transforms_that_make_no_sense_are_named(tmp_path, fields, message):
     write_image(tmp_path / "a.png", smooth_image(48, 64))
-    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "fl_x": 60.0}
-    content = {"frames": [frame | fields]} | fields
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    write_transforms(tmp_path, [frame("a.png", fl_x=60.0) | fields], **fields)
     with pytest.raises(ValueError, match=message) as caught:
         load_capture(tmp_path)
     assert str(tmp_path) in str(caught.value)
@@ -138,23 +139,16 @@ def test_transforms_that_make_no_sense_are_named(tmp_path, fields, message):
 
 @pytest.mark.parametrize("again", ["a.png", "./a.png", "a"])
 def test_an_image_of_two_frames_is_refused(tmp_path, again):
-    frames = [
-        {"file_path": name, "transform_matrix": np.eye(4).tolist(), "fl_x": 60.0}
-        for name in ("a.png", "b.png", again)
-    ]
     for name in ("a.png", "b.png"):
         write_image(tmp_path / name, smooth_image(48, 64))
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    write_transforms(tmp_path, [frame(name, fl_x=60.0) for name in ("a.png", "b.png", again)])
     refused(ValueError, "s.json: images of more than one frame: a[^b]*; keep one", load_capture, tmp_path)
 
 
 def test_missing_images_of_transforms_are_named_by_their_paths(tmp_path):
     """The folder `images` and the flag data.images have no meaning for them."""
-    frames = [
-        {"file_path": f"photos/{name}.png", "w": 64, "h": 48, "fl_x": 50.0, "transform_matrix": pose.tolist()}
-        for name, pose in (("a", np.eye(4)), ("b", np.diag([-1.0, -1.0, 1.0, 1.0])))
-    ]
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    frames = [frame("photos/a.png"), frame("photos/b.png", np.diag([-1.0, -1.0, 1.0, 1.0]))]
+    write_transforms(tmp_path, frames, w=64, h=48, fl_x=50.0)
     with pytest.raises(FileNotFoundError, match="correct file_path in its transforms.json") as caught:
         load_capture(tmp_path)
     assert f"2 of 2 images are not in {tmp_path}: photos/a.png, photos/b.png;" in str(caught.value)
@@ -169,21 +163,14 @@ def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):
     for i in range(4):
         write_image(tmp_path / "images" / f"f{i}.png", smooth_image(48, 64, i))
         cv2.imwrite(str(tmp_path / "own" / f"f{i}.png"), np.zeros((48, 64), dtype=np.uint8))
-        matrix = np.eye(4)
-        matrix[0, 3] = i
-        frame = {"file_path": f"images/f{i}.png", "transform_matrix": matrix.tolist()}
-        frames.append(frame | ([{}, {"mask_path": f"own/f{i}.png"}, {"mask_path": None}, {}][i]))
-    (tmp_path / "p.ply").write_text(
-        "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
-        "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
-        "1 2 3 9 8 7\n4 5 6 1 2 3\n"
-    )
-    content = {
-        **{"fl_x": 60.0, "fl_y": 61.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48, "camera_model": "OPENCV"},
-        **{"k1": -0.1, "k2": 0.01, "p1": 0.001, "p2": 0.0, "frames": frames, "ply_file_path": "p.ply"},
-        **{"train_filenames": [f"images/f{i}.png" for i in (0, 1, 3)], "test_filenames": ["./images/f2.png"]},
-    }
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
+        masks = [{}, {"mask_path": f"own/f{i}.png"}, {"mask_path": None}, {}][i]
+        frames.append(frame(f"images/f{i}.png", at(i, 0, 0), **masks))
+    write_ply(tmp_path / "p.ply", [[1, 2, 3], [4, 5, 6]], [[9, 8, 7], [1, 2, 3]])
+    lens = {"fl_x": 60.0, "fl_y": 61.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48, "camera_model": "OPENCV"}
+    lens |= {"k1": -0.1, "k2": 0.01, "p1": 0.001, "p2": 0.0}
+    train, test = [f"images/f{i}.png" for i in (0, 1, 3)], ["./images/f2.png"]
+    lists = {"train_filenames": train, "test_filenames": test}
+    write_transforms(tmp_path, frames, ply_file_path="p.ply", **lens, **lists)
     assert all(camera.mask_path is None for camera in load_capture(tmp_path, masks=False).cameras)
     capture = load_capture(tmp_path)
     assert capture.test == [2] and not capture.has_alpha
@@ -196,12 +183,8 @@ def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):
 
 
 def test_a_transforms_file_of_any_name_needs_no_photographs(tmp_path):
-    matrix = np.eye(4)
-    matrix[:3, 3] = 10, 20, 30
-    frames = [{"file_path": "view/b", "transform_matrix": matrix.tolist()}]
-    frames.append({"file_path": "view/a", "transform_matrix": np.eye(4).tolist(), "fl_x": 80})
-    file = tmp_path / "mine.json"
-    file.write_text(json.dumps({"w": 64, "h": 48, "fl_x": 50, "cx": 30, "cy": 20, "frames": frames}))
+    frames = [frame("view/b", at(10, 20, 30)), frame("view/a", fl_x=80)]
+    file = write_transforms(tmp_path, frames, "mine.json", w=64, h=48, fl_x=50, cx=30, cy=20)
     first, second = read_cameras(file, np.array([10.0, 20.0, 30.0]))
     assert (first.name, second.name, second.width, second.height) == ("view/a", "view/b", 64, 48)
     np.testing.assert_allclose(second.K, [[50, 0, 30], [0, 50, 20], [0, 0, 1]])
@@ -224,13 +207,11 @@ def test_errors_name_the_file(tmp_path):
     refused(FileNotFoundError, "nowhere", read_cameras, tmp_path / "nowhere", np.zeros(3))
     refused(FileNotFoundError, "holds no capture", read_cameras, tmp_path, np.zeros(3))
     file = tmp_path / "c.json"
+    without_pose = '{"w": 4, "h": 4, "fl_x": 3, "frames": [{"file_path": "a"}]}'
     for text, reason in (
         ("{", "no JSON"),
         ('{"frames": []}', "has no cameras"),
-        (
-            '{"w": 4, "h": 4, "fl_x": 3, "frames": [{"file_path": "a"}]}',
-            "frame 0: the field 'transform_matrix'",
-        ),
+        (without_pose, "frame 0: the field transform_matrix"),
     ):
         file.write_text(text)
         with pytest.raises(ValueError, match=reason) as raised:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lengths of a capture, whatever its cameras are; lenses without their distortion."""
 
-import json
 import time
 import warnings
 
@@ -15,7 +14,7 @@ from blitzgs.capture.cameras import camera_centres, rectify
 from blitzgs.capture.capture import load_capture
 from blitzgs.capture.lengths import NEAR_OF_EXTENT
 from blitzgs.capture.lens import Lens
-from tests.capture.helpers import as_text, smooth_image, write_image
+from tests.capture.helpers import as_text, at, frame, smooth_image, write_image, write_ply, write_transforms
 from tests.helpers import look_at_origin, refused
 
 COUNT, W, H = 12, 64, 48
@@ -37,19 +36,13 @@ def write(root, form, rotations, centres, points):
         write_image(root / "images" / name, smooth_image(H, W, seed))
     colors = np.full((len(points), 3), 120, dtype=np.uint8)
     if form == "transforms":
-        rows = "".join(f"{x!r} {y!r} {z!r} 120 120 120\n" for x, y, z in points.tolist())
-        kinds = [f"property double {axis}\n" for axis in "xyz"] + [
-            f"property uchar {channel}\n" for channel in ("red", "green", "blue")
-        ]
-        head = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n{''.join(kinds)}end_header\n"
-        (root / "p.ply").write_text(head + rows)
+        write_ply(root / "p.ply", points, colors)
         frames = []
         for name, rotation, centre in zip(NAMES, rotations, centres, strict=True):
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = rotation.T @ np.diag([1.0, -1, -1]), centre
-            frames.append({"file_path": f"images/{name}", "transform_matrix": pose.tolist()})
-        content = {"fl_x": 50.0, "w": W, "h": H, "ply_file_path": "p.ply", "frames": frames}
-        (root / "transforms.json").write_text(json.dumps(content))
+            pose = at(*centre)
+            pose[:3, :3] = rotation.T @ np.diag([1.0, -1, -1])
+            frames.append(frame(f"images/{name}", pose))
+        write_transforms(root, frames, fl_x=50.0, w=W, h=H, ply_file_path="p.ply")
         return
     model = colmap.ColmapModel(
         [colmap.ColmapCamera(1, "PINHOLE", W, H, np.array([50.0, 50.0, W / 2, H / 2]))],
@@ -136,10 +129,8 @@ def test_an_overview_that_shows_the_scene_is_kept_but_decides_on_no_length(tmp_p
     rotations[STRAY], centres[STRAY] = look_at_origin(at)[:3, :3], at
     write(tmp_path, "binary", rotations, centres, points)
     capture, said = quiet_load(tmp_path)
-    assert (
-        len(capture.cameras) == COUNT and capture.apart == [STRAY] and not capture.about.strays and not said
-    )
-    assert capture.extent < 6
+    assert len(capture.cameras) == COUNT and capture.apart == [STRAY] and capture.extent < 6
+    assert not capture.about.strays and not said
 
 
 def test_two_groups_of_cameras_are_no_strays(tmp_path):

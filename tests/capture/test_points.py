@@ -6,7 +6,6 @@ import re
 import shutil
 
 import numpy as np
-import plyfile
 import pytest
 
 from blitzgs.capture import colmap
@@ -15,7 +14,7 @@ from blitzgs.capture.layouts import read_layout
 from blitzgs.capture.points import file_points
 from blitzgs.formats.ply import read_point_cloud
 from tests.capture import helpers as files
-from tests.capture.helpers import as_text, smooth_image, write_capture, write_image
+from tests.capture.helpers import as_text, frame, warned, write_capture, write_ply, write_transforms
 from tests.helpers import refused
 
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -25,37 +24,17 @@ POSITIONS = np.random.default_rng(1).uniform(-1, 1, (COUNT, 3))
 C0 = 0.28209479177387814
 
 
-def write_ply(path, names, values, kind, axes="xyz", positions=POSITIONS):
-    types = [(axis, "f4") for axis in axes] + [(name, kind) for name in names]
-    rows = np.zeros(len(positions), dtype=types)
-    for i, axis in enumerate(axes):
-        rows[axis] = positions[:, i]
-    for i, name in enumerate(names):
-        rows[name] = values[:, i]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(path)
-    return path
+WORDS = ["red green blue", "Red Green Blue", "RED GREEN BLUE", "r g b", "R G B", "color_r color_g color_b"]
 
 
-@pytest.mark.parametrize(
-    "names",
-    [
-        ("red", "green", "blue"),
-        ("Red", "Green", "Blue"),
-        ("RED", "GREEN", "BLUE"),
-        ("diffuse_red", "diffuse_green", "diffuse_blue"),
-        ("r", "g", "b"),
-        ("R", "G", "B"),
-        ("color_r", "color_g", "color_b"),
-    ],
-)
+@pytest.mark.parametrize("words", [*WORDS, "diffuse_red diffuse_green diffuse_blue"])
 @pytest.mark.parametrize("kind", ["u1", "i4", "u2", "f4", "f8", "fraction"])
-def test_colours_by_name_and_kind_of_number(tmp_path, names, kind):
+def test_colours_by_name_and_kind_of_number(tmp_path, words, kind):
     values = COLORS / 255 if kind == "fraction" else COLORS
-    path = write_ply(tmp_path / "a.ply", names, values, "f4" if kind == "fraction" else kind)
-    cloud = read_point_cloud(path)
+    kind = "f4" if kind == "fraction" else kind
+    cloud = read_point_cloud(write_ply(tmp_path / "a.ply", POSITIONS, values, words.split(), kind))
     np.testing.assert_array_equal(cloud.colors, COLORS)
-    assert cloud.colors_from == ", ".join(name.lower() for name in names)
+    assert cloud.colors_from == words.lower().replace(" ", ", ")
 
 
 @pytest.mark.parametrize("kind", ["f4", "f8"])
@@ -74,7 +53,7 @@ def test_colours_by_name_and_kind_of_number(tmp_path, names, kind):
 def test_colours_that_overshoot_their_range(tmp_path, kind, change, is_fraction):
     values = COLORS / 255 if is_fraction else COLORS.astype(float)
     values[0, 0] = change
-    colors = read_point_cloud(write_ply(tmp_path / "a.ply", ("red", "green", "blue"), values, kind)).colors
+    colors = read_point_cloud(write_ply(tmp_path / "a.ply", POSITIONS, values, kind=kind)).colors
     np.testing.assert_array_equal(colors[1:], COLORS[1:])
     assert colors[0, 0] == (255 if change > 1 else 0)
 
@@ -84,22 +63,24 @@ def test_gaussians_have_the_colour_that_all_sides_show(tmp_path, extra):
     names = ("f_dc_0", "f_dc_1", "f_dc_2", *extra)
     values = np.zeros((COUNT, len(names)))
     values[:, :3] = (COLORS / 255 - 0.5) / C0
-    cloud = read_point_cloud(write_ply(tmp_path / "a.ply", names, values, "f4"))
+    cloud = read_point_cloud(write_ply(tmp_path / "a.ply", POSITIONS, values, names, "f4"))
     np.testing.assert_array_equal(cloud.colors, COLORS)
     assert cloud.colors_from == "f_dc_0 to f_dc_2"
     values[3, 1] = np.nan
     with pytest.raises(ValueError, match="a.ply: a point has the colour nan"):
-        read_point_cloud(write_ply(tmp_path / "a.ply", names, values, "f4"))
+        read_point_cloud(write_ply(tmp_path / "a.ply", POSITIONS, values, names, "f4"))
 
 
 def test_coefficients_beyond_black_and_white_are_clipped(tmp_path):
     values = np.tile([[-9.0, 0.0, 9.0]], (COUNT, 1))
-    cloud = read_point_cloud(write_ply(tmp_path / "a.ply", ("f_dc_0", "f_dc_1", "f_dc_2"), values, "f4"))
+    cloud = read_point_cloud(
+        write_ply(tmp_path / "a.ply", POSITIONS, values, ("f_dc_0", "f_dc_1", "f_dc_2"), "f4")
+    )
     assert (cloud.colors == [0, 128, 255]).all()
 
 
 def test_capital_axes_are_read(tmp_path):
-    cloud = read_point_cloud(write_ply(tmp_path / "a.ply", (), COLORS, "u1", axes="XYZ"))
+    cloud = read_point_cloud(write_ply(tmp_path / "a.ply", POSITIONS, axes="XYZ"))
     np.testing.assert_allclose(cloud.positions, POSITIONS, atol=1e-6)
 
 
@@ -115,9 +96,8 @@ def transforms_capture(root, names=4, **fields):
     for name, world_to_camera in zip(model.images.names, colmap.world_to_camera(model.images), strict=True):
         pose = applied @ np.linalg.inv(world_to_camera) @ np.diag([1, -1, -1, 1.0])
         pose[:3, 3] *= fields.get("applied_scale", 1.0)
-        frames.append({"file_path": f"images/{name}", "transform_matrix": pose.tolist()})
-    content = {"w": 64, "h": 48, "fl_x": 51.2, **fields, "frames": frames}
-    (root / "transforms.json").write_text(json.dumps(content))
+        frames.append(frame(f"images/{name}", pose))
+    write_transforms(root, frames, w=64, h=48, fl_x=51.2, **fields)
     return model
 
 
@@ -134,7 +114,7 @@ def test_the_points_of_colmap_beside_transforms_are_used_in_their_world(tmp_path
     expected = (model.points.positions @ matrix[:, :3].T + matrix[:, 3]) * fields.get("applied_scale", 1.0)
     np.testing.assert_allclose(capture.points + capture.offset, expected, atol=1e-9)
     np.testing.assert_array_equal(capture.colors, model.points.colors)
-    assert capture.about.points_from == "colmap/sparse/0" and capture.about.blind == 0
+    assert capture.about.points_from == "colmap/sparse/0/points3D.bin" and capture.about.blind == 0
 
 
 def test_points_of_another_world_are_named_and_not_used(tmp_path):
@@ -152,7 +132,7 @@ def test_points_of_another_world_are_named_and_not_used(tmp_path):
 @pytest.mark.parametrize("name", ["sparse_pc.ply", "points3D.ply", "points3d.ply"])
 def test_clouds_beside_transforms_that_programs_write(tmp_path, name):
     transforms_capture(tmp_path)
-    write_ply(tmp_path / name, ("red", "green", "blue"), COLORS, "u1")
+    write_ply(tmp_path / name, POSITIONS, COLORS)
     capture = load_capture(tmp_path)
     np.testing.assert_allclose(capture.points + capture.offset, POSITIONS, atol=1e-6)
     np.testing.assert_array_equal(capture.colors, COLORS)
@@ -162,14 +142,13 @@ def test_clouds_beside_transforms_that_programs_write(tmp_path, name):
 def test_any_other_cloud_beside_transforms_is_named(tmp_path):
     transforms_capture(tmp_path)
     (tmp_path / "colmap").rename(tmp_path / "other")
-    write_ply(tmp_path / "cloud.ply", ("red", "green", "blue"), COLORS, "u1")
-    with pytest.warns(UserWarning, match='cloud.ply beside it is not used.*"ply_file_path": "cloud.ply"'):
-        load_capture(tmp_path)
+    write_ply(tmp_path / "cloud.ply", POSITIONS, COLORS)
+    warned('cloud.ply beside it is not used.*"ply_file_path": "cloud.ply"', load_capture, tmp_path)
 
 
 def test_points_without_colours_are_said(tmp_path):
     transforms_capture(tmp_path)
-    write_ply(tmp_path / "sparse_pc.ply", ("intensity",), COLORS, "f4")
+    write_ply(tmp_path / "sparse_pc.ply", POSITIONS, COLORS[:, :1], ("intensity",), "f4")
     with pytest.warns(UserWarning, match="no colours and start grey: the file has x, y, z, intensity"):
         assert (load_capture(tmp_path).colors == 128).all()
 
@@ -186,7 +165,7 @@ def test_a_colmap_model_with_its_points_in_a_ply(tmp_path, suffix):
     if suffix == ".txt":
         as_text(folder)
     (folder / f"points3D{suffix}").unlink()
-    write_ply(folder / "points3D.ply", ("red", "green", "blue"), COLORS, "u1")
+    write_ply(folder / "points3D.ply", POSITIONS, COLORS)
     capture = load_capture(root)
     np.testing.assert_array_equal(capture.colors, COLORS)
     assert capture.about.points_from == "sparse/0/points3D.ply" and capture.track_lengths is None
@@ -195,9 +174,8 @@ def test_a_colmap_model_with_its_points_in_a_ply(tmp_path, suffix):
 def test_a_ply_beside_the_points_of_the_model_is_not_used(tmp_path):
     """INRIA's code writes one there."""
     root = write_capture(tmp_path, [f"{i}.png" for i in range(4)])
-    write_ply(root / "sparse" / "0" / "points3D.ply", ("red", "green", "blue"), COLORS, "u1")
+    write_ply(root / "sparse" / "0" / "points3D.ply", POSITIONS, COLORS)
     assert len(load_capture(root).points) == 20
-    write_image(root / "images" / "0.png", smooth_image(48, 64))
 
 
 UTM = np.array([412_345.0, 5_654_321.0, 120.0])
@@ -263,13 +241,11 @@ def test_points_in_world_coordinates_and_cameras_without_the_offset(tmp_path):
     capture = files.Posed(origin=UTM)
     files.pix4d(capture, capture.write_images(tmp_path) / "params", UTM)
     write_las(tmp_path / "cloud.las", capture.points)
-    with pytest.warns(UserWarning, match="the points are in coordinates of WGS 84 / UTM zone 33N"):
-        loaded = load_capture(tmp_path)
+    loaded = warned("the points are in coordinates of WGS 84 / UTM zone 33N", load_capture, tmp_path)
     np.testing.assert_allclose(loaded.points + loaded.offset, capture.points - UTM, atol=1e-4)
     assert loaded.colors.tolist() == [[128] * 3] * 40
     (tmp_path / "other.laz").write_bytes(b"")
-    with pytest.warns(UserWarning, match="2 files of points .* call one of them points.las"):
-        load_capture(tmp_path)
+    warned("2 files of points .* call one of them points.las", load_capture, tmp_path)
 
 
 def test_a_colmap_model_takes_points_and_an_offset_from_files_beside_it(tmp_path):

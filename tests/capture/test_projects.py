@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Projects of other programs give the pixels, points and world of the capture that they were written from."""
 
-import json
 import shutil
-import warnings
 
 import numpy as np
 import pytest
@@ -15,22 +13,14 @@ from blitzgs.capture.projects.realitycapture import read_realitycapture
 from tests.capture import helpers as files
 from tests.helpers import refused
 
+pytestmark = pytest.mark.filterwarnings("ignore")
 UTM = np.array([412_345.0, 5_654_321.0, 120.0])
-
-
-@pytest.fixture(autouse=True)
-def _quiet():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
 
 
 def residual(capture, views, points=None):
     """Largest distance in pixels of the capture's points, `points` in the coordinates of the views."""
     points = capture.points if points is None else points
-    assert [view.name.removesuffix(".JPG") for view in views] == [
-        n.removesuffix(".JPG") for n in capture.names
-    ]
+    assert [view.name for view in views] == capture.names
     worst = 0.0
     for index, view in enumerate(views):
         x, y, z = view.world_to_camera[:3, :3] @ points.T + view.world_to_camera[:3, 3:]
@@ -55,10 +45,8 @@ def test_metashape(tmp_path):
     np.testing.assert_allclose(source.frame.to_world(local), capture.points, atol=1e-8)
     np.testing.assert_allclose(source.frame.from_world(capture.points), local, atol=1e-8)
     assert any("1 photographs of the project have no pose" in note for note in source.notes)
-    text = (tmp_path / "cameras.xml").read_text()
-    (tmp_path / "cameras.xml").write_text(
-        text.replace(' component_id="2"', "").replace('id="3" ', 'id="3" enabled="false" ')
-    )
+    text = (tmp_path / "cameras.xml").read_text().replace(' component_id="2"', "")
+    (tmp_path / "cameras.xml").write_text(text.replace('id="3" ', 'id="3" enabled="false" '))
     views, _, again = read(tmp_path)
     assert len(views) == 5 and again.frame.scale == source.frame.scale
 
@@ -109,15 +97,11 @@ def test_realitycapture_with_the_points_of_a_bundle(tmp_path, separator, header)
 
 
 def test_realitycapture_angles_are_those_of_its_help(tmp_path):
-    rows = [
-        ["down.jpg", 0, 0, 0], ["down_east.jpg", 90, 0, 0], ["north.jpg", 0, 90, 0], ["east.jpg", 90, 90, 0],
-    ]  # fmt: skip
-    text = "#name,heading,pitch,roll,x,y,alt,f\n"
-    text += "".join(",".join(map(str, row)) + ",1,2,3,30\n" for row in rows)
-    (tmp_path / "r.csv").write_text(text)
-    right, down, forward = np.stack(
-        [v.world_to_camera[:3, :3] for v in read_realitycapture(tmp_path / "r.csv").views], axis=1
-    )
+    angles = {"down.jpg": "0,0", "down_east.jpg": "90,0", "north.jpg": "0,90", "east.jpg": "90,90"}
+    rows = [f"{name},{angle},0,1,2,3,30\n" for name, angle in angles.items()]
+    (tmp_path / "r.csv").write_text("#name,heading,pitch,roll,x,y,alt,f\n" + "".join(rows))
+    views = read_realitycapture(tmp_path / "r.csv").views
+    right, down, forward = np.stack([view.world_to_camera[:3, :3] for view in views], axis=1)
     np.testing.assert_allclose(forward, [[0, 0, -1], [0, 0, -1], [0, 1, 0], [1, 0, 0]], atol=1e-12)
     np.testing.assert_allclose(-down, [[0, 1, 0], [1, 0, 0], [0, 0, 1], [0, 0, 1]], atol=1e-12)
     np.testing.assert_allclose(right[:2], [[1, 0, 0], [0, -1, 0]], atol=1e-12)
@@ -187,15 +171,14 @@ def test_opendronemap_offset_or_its_topocentric_original(tmp_path):
 
 def test_a_label_without_a_suffix_finds_its_photograph_in_a_folder(tmp_path):
     capture = files.Posed(names=[f"flight_1/a{i}.JPG" for i in range(6)])
-    files.metashape(
-        capture, capture.write_images(tmp_path) / "export.xml", labels=[f"a{i}" for i in range(6)]
-    )
+    path = capture.write_images(tmp_path) / "export.xml"
+    files.metashape(capture, path, labels=[f"A{i}" for i in range(6)])
     loaded = load_capture(tmp_path / "export.xml")
     assert [camera.image_path.name for camera in loaded.cameras] == [f"a{i}.JPG" for i in range(6)]
     assert loaded.cameras[0].name == "flight_1/a0.JPG"
     (images := tmp_path / "images").joinpath("flight_2").mkdir()
     shutil.copy(images / "flight_1/a0.JPG", images / "flight_2")
-    with pytest.raises(ValueError, match=r"2 files could be the photograph a0 \(flight_1/a0.JPG, flight_2/a"):
+    with pytest.raises(ValueError, match=r"2 files could be the photograph A0 \(flight_1/a0.JPG, flight_2/a"):
         load_capture(tmp_path / "export.xml")
     shutil.copy(images / "flight_1/a0.JPG", images)
     assert load_capture(tmp_path / "export.xml").cameras[0].name == "a0.JPG"
@@ -211,102 +194,54 @@ def test_several_projects_are_refused_by_name(tmp_path):
         load_capture(tmp_path / "images" / "DJI_0000.JPG")
 
 
-def bomb(root):
-    levels = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 10))
-    text = f'<!DOCTYPE d [<!ENTITY e0 "lol">{levels}]><document><chunk>&e9;</chunk></document>'
-    (root / "cameras.xml").write_text(text)
+PIX4D = "params/site_calibrated_camera_parameters.txt"
+WRITERS = {
+    "c.xml": files.metashape,
+    "r.csv": files.realitycapture,
+    "bundle.out": files.bundler,
+    PIX4D: lambda capture, path: files.pix4d(capture, path.parent, UTM),
+    "project.opf": lambda capture, path: files.opf(capture, path.parent, UTM),
+    "reconstruction.json": files.opensfm,
+}
+LEVELS = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 10))
+BOMB = f'<!DOCTYPE d [<!ENTITY e0 "lol">{LEVELS}]><document><chunk>&e9;</chunk></document>'
+EXTERNAL = '<!DOCTYPE d [<!ENTITY e SYSTEM "file:///etc/passwd">]><document><chunk>&e;</chunk></document>'
 
 
-def external(root):
-    text = '<!DOCTYPE d [<!ENTITY e SYSTEM "file:///etc/passwd">]><document><chunk>&e;</chunk></document>'
-    (root / "cameras.xml").write_text(text)
+def cut(count):
+    return lambda text: "\n".join(text.splitlines()[:count])
 
 
-def edited(write, name, old, new):
-    def damage(root):
-        write(files.Posed(), root / name)
-        text = (root / name).read_text()
-        assert old in text
-        (root / name).write_text(text.replace(old, new))
-
-    return damage
-
-
-def cut_bundle(root):
-    files.bundler(files.Posed(), root / "bundle.out")
-    (root / "bundle.out").write_text("\n".join((root / "bundle.out").read_text().splitlines()[:100]))
-
-
-def many_points(root):
-    files.bundler(files.Posed(), root / "bundle.out")
-    text = (root / "bundle.out").read_text().replace("7 40\n", "7 4000000000\n")
-    (root / "bundle.out").write_text(text)
-
-
-def cut_pix4d(root):
-    files.pix4d(files.Posed(), root / "params", UTM)
-    path = root / "params" / "site_calibrated_camera_parameters.txt"
-    path.write_text("\n".join(path.read_text().splitlines()[:-2]))
+# A file, a text in it and what takes its place, or a function of all its text, and the message.
+DAMAGE = [
+    ("c.xml", lambda _: BOMB, r"c.xml: line 1: no readable XML \(it defines entities"),
+    ("c.xml", lambda _: EXTERNAL, r"c.xml: line 1: no readable XML \(it defines entities"),
+    ("c.xml", ("</cameras>", "</camera>"), r"c.xml: line \d+: no readable XML"),
+    ("c.xml", ('type="frame">', 'type="spherical">'), "sensor 7: type 'spherical' makes"),
+    ("c.xml", ("<f>81.5</f>", "<f>nan</f>"), "sensor 7: f must be a finite number, got 'nan'"),
+    ("c.xml", ('height="72"/>\n<f>', 'height="1e9"/>\n<f>'), "is no size of an image"),
+    ("c.xml", ('"><transform>', '"><transform>2 '), r"camera 0 .*transform: expected 16 num"),
+    ("r.csv", ("DJI_0001.JPG,", "DJI_0001.JPG,x"), "line 4: x must be a finite number"),
+    ("r.csv", ("DJI_0001.JPG,", ""), "line 4: 15 values in 16 columns"),
+    ("bundle.out", cut(100), "bundle.out: 100 lines are too few for 7 cameras and 40 points"),
+    ("bundle.out", ("7 40\n", "7 4000000000\n"), "expected the numbers of cameras and points"),
+    (PIX4D, cut(-2), "58 lines are not 10 for each camera: it is cut off"),
+    (PIX4D, ("0 0 1\n", "0 1\n"), "line 9: K, row 3: expected 3 numbers, got 2"),
+    ("project.opf", ("calibrated", "other"), r"has no application/opf-calibrated-cameras\+json"),
+    ("project.opf", ("camera-list%201.json", "../secret.json"), "'../secret.json' leads outside the project"),
+    ("reconstruction.json", ("brown", "spherical"), "'spherical' cannot be read; known:"),
+    ("reconstruction.json", ('"shots"', '"shot"'), "the field shots is missing"),
+    ("reconstruction.json", ("[{", "["), "reconstruction.json: no JSON"),
+    ("reconstruction.json", ('"width": 96', '"width": Infinity'), "a finite number, got inf"),
+]
 
 
-def opf_without_calibration(root):
-    files.opf(files.Posed(), root, UTM)
-    content = json.loads((root / "project.opf").read_text())
-    content["items"] = content["items"][:2]
-    (root / "project.opf").write_text(json.dumps(content))
-
-
-def opf_that_leads_outside(root):
-    files.opf(files.Posed(), root, UTM)
-    text = (root / "project.opf").read_text().replace("camera-list%201.json", "../secret.json")
-    (root / "project.opf").write_text(text)
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (bomb, r"cameras.xml: line 1: no readable XML \(it defines entities"),
-        (external, r"cameras.xml: line 1: no readable XML \(it defines entities"),
-        (edited(files.metashape, "c.xml", "</cameras>", "</camera>"), r"c.xml: line \d+: no readable XML"),
-        (
-            edited(files.metashape, "c.xml", 'type="frame">', 'type="spherical">'),
-            "sensor 7: type 'spherical' makes",
-        ),
-        (
-            edited(files.metashape, "c.xml", "<f>81.5</f>", "<f>nan</f>"),
-            "sensor 7: f: expected a finite number",
-        ),
-        (
-            edited(files.metashape, "c.xml", 'height="72"/>\n<f>', 'height="1e9"/>\n<f>'),
-            "is no size of an image",
-        ),
-        (
-            edited(files.metashape, "c.xml", '"><transform>', '"><transform>2 '),
-            r"camera 0 .*transform: expected 16 num",
-        ),
-        (
-            edited(files.realitycapture, "r.csv", "DJI_0001.JPG,", "DJI_0001.JPG,x"),
-            "line 4: x: expected numbers",
-        ),
-        (edited(files.realitycapture, "r.csv", "DJI_0001.JPG,", ""), "line 4: 15 values in 16 columns"),
-        (cut_bundle, "bundle.out: 100 lines are too few for 7 cameras and 40 points"),
-        (many_points, "expected the numbers of cameras and points"),
-        (cut_pix4d, "58 lines are not 10 for each camera: it is cut off"),
-        (opf_without_calibration, r"the project has no application/opf-calibrated-cameras\+json"),
-        (opf_that_leads_outside, "'../secret.json' leads outside the project"),
-        (
-            edited(files.opensfm, "reconstruction.json", "brown", "spherical"),
-            "'spherical' cannot be read; known:",
-        ),
-        (edited(files.opensfm, "reconstruction.json", '"shots"', '"shot"'), "the field shots is missing"),
-        (edited(files.opensfm, "reconstruction.json", "[{", "["), "reconstruction.json: no JSON"),
-        (
-            edited(files.opensfm, "reconstruction.json", '"width": 96', '"width": Infinity'),
-            "a finite number, got inf",
-        ),
-    ],
-)
-def test_damaged_and_hostile_projects_are_refused(tmp_path, damage, message):
-    files.Posed().write_images(tmp_path)
-    damage(tmp_path)
+@pytest.mark.parametrize(("name", "change", "message"), DAMAGE)
+def test_damaged_and_hostile_projects_are_refused(tmp_path, name, change, message):
+    capture = files.Posed()
+    WRITERS[name](capture, capture.write_images(tmp_path) / name)
+    text = (tmp_path / name).read_text()
+    damaged = change(text) if callable(change) else text.replace(*change)
+    assert damaged != text
+    (tmp_path / name).write_text(damaged)
     refused(ValueError, message, load_capture, tmp_path)

@@ -2,44 +2,58 @@
 """Splits by rule and by a capture's own files, and photographs that have no camera."""
 
 import itertools
-import json
 import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from blitzgs.capture.cameras import SourceView
 from blitzgs.capture.capture import load_capture
-from blitzgs.capture.usable import split_views
-from tests.capture.helpers import reconstruction, smooth_image, write_capture, write_image
+from blitzgs.capture.splits import split_views
+from tests.capture.helpers import (
+    frame,
+    reconstruction,
+    smooth_image,
+    warned,
+    write_capture,
+    write_image,
+    write_transforms,
+)
 from tests.helpers import look_at_origin, refused
 
 NAMES = ["a/1.jpg", "a/2.jpg", "b/1.jpg", "b/3.jpg"]
 ROOT = Path("/capture")
-PATHS = [ROOT / "images" / name for name in NAMES]
+
+
+def split(root, spec="auto", names=NAMES, paths=None):
+    """Train and test views of these names, whose images are in /capture/images or have these paths."""
+    paths = paths or [ROOT / "images" / name for name in names]
+    views = [SourceView(name, path, None, None, None) for name, path in zip(names, paths, strict=True)]
+    return split_views(views, root, spec)[:2]
 
 
 @pytest.mark.parametrize(("spec", "test"), [(2, [0, 2]), ("3", [0, 3]), (0, []), ("auto", [0])])
 def test_every_nth_view_is_held_out(spec, test):
-    train, found = split_views(NAMES, PATHS, ROOT, spec)
+    train, found = split(ROOT, spec)
     assert found == test and sorted(train + found) == [0, 1, 2, 3]
 
 
 def test_list_file_matches_names_file_names_and_stems(tmp_path):
     # A byte order mark, as of editors on Windows, is no part of the first line.
-    (tmp_path / "test.txt").write_bytes(b"\xef\xbb\xbfa\\1.jpg\r\n# held out\n\n2.jpg  # by file name\n3\n")
-    assert split_views(NAMES, PATHS, tmp_path, "test.txt") == ([2], [0, 1, 3])
-    assert split_views(NAMES, PATHS, ROOT, tmp_path / "test.txt") == ([2], [0, 1, 3])
+    (tmp_path / "test.txt").write_bytes(b"\xef\xbb\xbfa\\1.jpg\r\n# held out\n\n2.JPG  # by file name\n3\n")
+    assert split(tmp_path, "test.txt") == ([2], [0, 1, 3])
+    assert split(ROOT, tmp_path / "test.txt") == ([2], [0, 1, 3])
 
 
 def test_a_list_file_may_have_names_that_are_not_utf_8(tmp_path):
     (tmp_path / "test.txt").write_bytes(b"\xfc.jpg\n")
     names = ["1.jpg", "\udcfc.jpg"]
-    assert split_views(names, [tmp_path / name for name in names], tmp_path, "test.txt") == ([0], [1])
+    assert split(tmp_path, "test.txt", names) == ([0], [1])
 
 
 def test_a_name_without_parts_is_split_like_any_other(tmp_path):
-    assert split_views([".", "1.jpg"], [tmp_path, tmp_path / "1.jpg"], tmp_path) == ([1], [0])
+    assert split(tmp_path, names=[".", "1.jpg"]) == ([1], [0])
 
 
 @pytest.mark.parametrize(
@@ -52,24 +66,24 @@ def test_a_name_without_parts_is_split_like_any_other(tmp_path):
 )
 def test_list_entries_must_name_one_view(tmp_path, line, message):
     (tmp_path / "test.txt").write_text(line)
-    refused(ValueError, message, split_views, NAMES, PATHS, tmp_path, "test.txt")
+    refused(ValueError, message, split, tmp_path, "test.txt")
 
 
 def test_val_folder_is_used_when_it_is_there():
     paths = [ROOT / ("val" if i == 2 else "train") / "rgbs" / f"{i}.jpg" for i in range(4)]
-    assert split_views(NAMES, paths, ROOT, "auto") == ([0, 1, 3], [2])
-    assert split_views(NAMES, paths, ROOT, "val") == ([0, 1, 3], [2])
-    refused(ValueError, "no view's image is in /capture/val", split_views, NAMES, PATHS, ROOT, "val")
+    assert split(ROOT, paths=paths) == ([0, 1, 3], [2])
+    assert split(ROOT, "val", paths=paths) == ([0, 1, 3], [2])
+    refused(ValueError, "no view's image is in /capture/val", split, ROOT, "val")
 
 
 def test_invalid_splits_are_refused(tmp_path):
     for number in (1, "-1"):
         message = f"data.split: must be 0 .no view is held out. or at least 2, got {number}"
-        refused(ValueError, message, split_views, NAMES, PATHS, ROOT, number)
+        refused(ValueError, message, split, ROOT, number)
     with pytest.raises(ValueError, match=r"must be a whole number n .*, 'auto', 'val' or a file"):
-        split_views(NAMES, PATHS, ROOT, "missing.txt")
+        split(ROOT, "missing.txt")
     (tmp_path / "all.txt").write_text("\n".join(NAMES))
-    refused(ValueError, "leaves no training view of 4", split_views, NAMES, PATHS, tmp_path, "all.txt")
+    refused(ValueError, "leaves no training view of 4", split, tmp_path, "all.txt")
 
 
 pytestmark = [
@@ -81,13 +95,10 @@ FRAMES = [f"images/f{i}.png" for i in range(6)]
 
 
 def frames(names=FRAMES):
-    found = []
-    for i, name in enumerate(names):
-        angle, pose = 2 * np.pi * i / 6, np.eye(4)
-        centre = np.array([4 * np.cos(angle), 4 * np.sin(angle), 0.5])
-        pose[:3, :3], pose[:3, 3] = look_at_origin(centre)[:3, :3].T @ np.diag([1.0, -1, -1]), centre
-        found.append({"file_path": name, "transform_matrix": pose.tolist()})
-    return found
+    angles = 2 * np.pi * np.arange(len(names)) / 6
+    places = np.stack([4 * np.cos(angles), 4 * np.sin(angles), np.full(len(names), 0.5)], axis=1)
+    poses = [np.linalg.inv(look_at_origin(place)) @ np.diag([1.0, -1, -1, 1]) for place in places]
+    return [frame(name, pose) for name, pose in zip(names, poses, strict=True)]
 
 
 def write_images(root):
@@ -96,7 +107,7 @@ def write_images(root):
 
 
 def write(root, file="transforms.json", names=FRAMES, **fields):
-    (root / file).write_text(json.dumps({"fl_x": 40.0, "frames": frames(names), **fields}))
+    write_transforms(root, frames(names), file, fl_x=40.0, **fields)
 
 
 def split_of(root, **options):
@@ -167,12 +178,11 @@ def test_the_files_of_blenders_split_are_all_read(tmp_path, parts):
     for part in parts:
         write(tmp_path, f"transforms_{part}.json", names[part])
     if "train" not in parts:
-        refused(ValueError, "hold out every view", load_capture, tmp_path)
+        refused(ValueError, "the capture's own split leaves no training view of", load_capture, tmp_path)
         return
     train, test, capture = split_of(tmp_path)
-    assert train == names["train"] and test == [
-        n for part in ("val", "test") if part in parts for n in names[part]
-    ]
+    assert train == names["train"]
+    assert test == [name for part in ("val", "test") if part in parts for name in names[part]]
     assert capture.about.split_from == " and ".join(f"transforms_{part}.json" for part in parts)
 
 
@@ -180,8 +190,7 @@ def test_what_is_beside_transforms_json_is_named(tmp_path):
     write_images(tmp_path)
     write(tmp_path)
     write(tmp_path, "transforms_val.json", FRAMES[:1])
-    with pytest.warns(UserWarning, match="transforms.json is read, and transforms_val.json beside it not"):
-        load_capture(tmp_path)
+    warned("transforms.json is read, and transforms_val.json beside it not", load_capture, tmp_path)
 
 
 def models(root, counts, text=False):
@@ -199,10 +208,8 @@ def models(root, counts, text=False):
 def test_the_largest_of_several_models_is_read(tmp_path, counts, text):
     models(tmp_path, counts, text)
     best = counts.index(max(counts))
-    with pytest.warns(
-        UserWarning, match=f"of {len(counts)} COLMAP models, the largest is used: sparse/{best} "
-    ):
-        capture = load_capture(tmp_path)
+    message = f"of {len(counts)} COLMAP models, the largest is used: sparse/{best} "
+    capture = warned(message, load_capture, tmp_path)
     assert len(capture.cameras) == max(counts) and capture.about.cameras == f"sparse/{best}"
     other = len(counts) - 1
     named = load_capture(tmp_path, sparse=f"sparse/{other}")

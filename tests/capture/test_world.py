@@ -93,7 +93,8 @@ def test_a_damaged_file_is_refused_by_name(tmp_path, change, message):
 def test_east_north_up_and_geodetic_agree_with_pyproj(place):
     pyproj = pytest.importorskip("pyproj")
     frame = enu_frame(*place, "here")
-    exact = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978").transform(*place)
+    geocentric = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978")
+    exact = geocentric.transform(*place)
     np.testing.assert_allclose(frame.to_world(np.zeros(3)), exact, atol=1e-8)
     np.testing.assert_allclose(geodetic(np.array(exact)), place, atol=1e-8)
     topocentric = pyproj.Transformer.from_pipeline(
@@ -101,9 +102,7 @@ def test_east_north_up_and_geodetic_agree_with_pyproj(place):
         f"+h_0={place[2]}"
     )
     local = topocentric.transform(place[1] + 0.001, place[0] - 0.002, place[2] + 50)
-    there = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978").transform(
-        place[0] - 0.002, place[1] + 0.001, place[2] + 50
-    )
+    there = geocentric.transform(place[0] - 0.002, place[1] + 0.001, place[2] + 50)
     np.testing.assert_allclose(frame.from_world(np.array(there)), local, atol=1e-6)
     assert frame.label(np.zeros(3)).endswith(f"{place[2]:.2f} m (WGS 84)")
 
@@ -113,13 +112,10 @@ def test_a_frame_in_utm_is_right_within_its_stated_error():
     frame = enu_frame(47.5, 8.25, 432.0, "here")
     places = np.random.default_rng(2).uniform(-150, 150, (60, 3)) * [1, 1, 0.1]
     utm, error = frame_in(frame, "EPSG:32632", places)
-    exact = pyproj.Transformer.from_crs("EPSG:4978", pyproj.CRS("EPSG:32632").to_3d()).transform(
-        *frame.to_world(places).T
-    )
+    projection = pyproj.Transformer.from_crs("EPSG:4978", pyproj.CRS("EPSG:32632").to_3d())
+    exact = projection.transform(*frame.to_world(places).T)
     apart = np.linalg.norm(utm.to_world(places) - np.stack(exact, axis=1), axis=1)
-    assert (
-        apart.max() == pytest.approx(error) and error < 0.03
-    )  # the curvature over 200 m is 3 mm, the scale's
+    assert apart.max() == pytest.approx(error) and error < 0.03  # of the curvature over 200 m and the scale
     assert utm.scale == pytest.approx(0.9996, abs=2e-4)
     assert utm.label(np.zeros(3)).startswith("E 443") and utm.label(np.zeros(3)).endswith("(EPSG:32632)")
     refused(ValueError, "EPSG:4326 .* has angles", frame_in, frame, "EPSG:4326", places)
@@ -232,10 +228,8 @@ def test_both_files_of_points_are_read(setting, tmp_path):
     [
         ("name,E,N,image,x,y\n", "line 1: the columns h are missing"),
         ("name,E,N,h,image,x,y\nA,1,2,3,i.jpg,4\n", "line 2: 6 values in 7 columns"),
-        (
-            "name,E,N,h,image,x,y\nA,1,2,nan,i.jpg,4,5\n",
-            "line 2: a name, an image or a finite number is missing",
-        ),
+        ("name,E,N,h,image,x,y\nA,1,2,nan,i.jpg,4,5\n", "line 2: h must be a finite number, got 'nan'"),
+        ("name,E,N,h,image,x,y\nA,1,2,3,,4,5\n", "line 2: a name or an image is missing"),
         ("name,E,N,h,image,x,y\nA,1,2,3,i.jpg,4,5\nA,1,2,9,j.jpg,4,5\n", "line 3: A has another place"),
         ("EPSG:32633\n1 2 3 4 5\n", "line 2: expected E, N, h, x, y and an image"),
         ("EPSG:32633\n", "no points: expected the columns"),

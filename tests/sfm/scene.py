@@ -7,6 +7,9 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from blitzgs.capture.cameras import camera_centres
+from blitzgs.capture.world import fit_similarity
+
 WIDTH, HEIGHT, FOCAL = 400, 300, 380.0
 # Height, and the square [x0, y0, x1, y1] that a slab covers.
 _SLABS = [(0.0, (-12, -12, 12, 12)), (0.8, (-5, -4, -2, 0)), (1.4, (0, 0, 3, 2)), (1.0, (3, -5, 6, -2))]
@@ -67,7 +70,7 @@ def write_photographs(folder: Path, count: int = 8) -> np.ndarray:
 
 def with_gps(folder: Path, placed: np.ndarray, altitude: bool = True) -> np.ndarray:
     """Add EXIF with a camera and places in a scene of 15 metres per unit; returns metres east, north, up."""
-    metres = 15 * np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in placed])
+    metres = 15 * camera_centres(placed)
     for index, (east, north, up) in enumerate(metres):
         path = folder / f"view_{index}.jpg"
         photo = Image.open(path)
@@ -90,15 +93,10 @@ def _dms(degrees: float) -> tuple[float, float, float]:
 def aligned(found: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distances of camera centres and the angles in degrees between poses [N, 4, 4].
 
-    The poses found are moved by the similarity that fits their centres best (Umeyama 1991).
+    The poses found are moved by the similarity that fits their centres best.
     """
-    a, b = (-np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3]) for poses in (found, truth))
-    a0, b0 = a - a.mean(axis=0), b - b.mean(axis=0)
-    left, sizes, right = np.linalg.svd(b0.T @ a0)
-    sign = np.diag([1, 1, np.sign(np.linalg.det(left @ right))])
-    turn = left @ sign @ right
-    scale = (sizes * np.diag(sign)).sum() / (a0**2).sum()
-    away = np.linalg.norm(scale * a0 @ turn.T - b0, axis=1)
-    between = np.einsum("nij,kj,nlk->nil", found[:, :3, :3], turn, truth[:, :3, :3])
+    a, b = camera_centres(found), camera_centres(truth)
+    moved = fit_similarity(a, b)
+    between = np.einsum("nij,kj,nlk->nil", found[:, :3, :3], moved.rotation, truth[:, :3, :3])
     cosines = (np.trace(between, axis1=1, axis2=2) - 1) / 2
-    return away, np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    return np.linalg.norm(moved.to_world(a) - b, axis=1), np.degrees(np.arccos(np.clip(cosines, -1, 1)))

@@ -26,7 +26,7 @@ from blitzgs.sfm.photographs import Photographs, estimate, judge_positions
 from blitzgs.sfm.pycolmap_stage import features
 from blitzgs.sfm.reconstruct import Settings
 from blitzgs.sfm.report import Reconstruction, _reason, examine
-from tests.capture.helpers import Posed, opensfm, pix4d, realitycapture
+from tests.capture.helpers import Posed, opensfm, pix4d, realitycapture, warned
 from tests.sfm.scene import FOCAL, aligned, with_gps, write_photographs
 from tests.training.tiny import OVERRIDES, as_flags
 
@@ -127,9 +127,8 @@ def test_wrong_poses_are_doubtful(made, tmp_path):
     model = pycolmap.Reconstruction(root / "capture/sparse/0")
     image = next(image for image in model.images.values() if image.name == "view_5.jpg")
     pose = image.cam_from_world()
-    image.frame.set_cam_from_world(
-        image.camera_id, pycolmap.Rigid3d(pose.rotation, pose.translation + [0, 1e3, 0])
-    )
+    wrong = pycolmap.Rigid3d(pose.rotation, pose.translation + [0, 1e3, 0])
+    image.frame.set_cam_from_world(image.camera_id, wrong)
     (tmp_path / "0").mkdir()
     model.write(tmp_path / "0")
     photographs = Photographs.of(root / "photos")
@@ -284,12 +283,12 @@ def test_a_failing_stage_shows_colmaps_last_words(tmp_path, monkeypatch):
     log = tmp_path / "log.txt"
     with log.open("w") as lock, pytest.raises(engine.StageError, match="status 3: it is dark") as error:
         engine._run(
-            ["sh", "-c", "echo start; echo it is dark; exit 3"], log, lock.fileno(), lambda line: None
+            ["sh", "-c", "echo start; echo it is dark; exit 3"], log, lock.fileno(), lambda done, total: None
         )
     assert str(log) in str(error.value) and log.read_text() == "start\nit is dark\n"
     monkeypatch.setattr(engine, "_LEAST_SPACE", math.inf)
     with log.open("w") as lock, pytest.raises(engine.StageError, match="the disk is nearly full"):
-        engine._run(["false"], log, lock.fileno(), lambda line: None)
+        engine._run(["false"], log, lock.fileno(), lambda done, total: None)
 
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -305,8 +304,7 @@ def test_photographs_in_other_formats_are_named(tmp_path):
     (tmp_path / "view_0.DNG").write_bytes(b"")  # the raw data of a photograph
     Photographs.of(tmp_path)
     (tmp_path / "view_9.heic").write_bytes(b"")
-    with pytest.warns(UserWarning, match=r"only its 3 photographs are used; \.heic cannot be read: convert"):
-        Photographs.of(tmp_path)
+    warned(r"only its 3 photographs are used; \.heic cannot be read: convert", Photographs.of, tmp_path)
 
 
 def test_photographs_alone_are_recognised(tmp_path, capsys):

@@ -15,6 +15,7 @@ from blitzgs.sfm import engine
 from blitzgs.sfm.pycolmap_stage import _centre_lenses
 from blitzgs.sfm.refine import fit_of, refine
 from blitzgs.sfm.report import misses
+from tests.capture.helpers import warned
 from tests.helpers import refused
 from tests.training.tiny import write_tiny_capture
 
@@ -97,12 +98,8 @@ def test_lens_and_poses_are_found(scene, tmp_path, capsys):
     after = np.stack(list(now.values()))
     assert after.mean(axis=0) == pytest.approx(before.mean(axis=0), abs=1e-3 * size)
     assert after.std(axis=0) == pytest.approx(before.std(axis=0), rel=0.02)
-    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == [
-        "geo.json",
-        "images",
-        "sfm",
-        "sparse",
-    ]
+    names = {path.name for path in (tmp_path / "new").iterdir()}
+    assert names == {"geo.json", "images", "sfm", "sparse"}
     assert (tmp_path / "new/images").resolve() == (capture / "images").resolve()
 
 
@@ -149,10 +146,8 @@ def test_what_cannot_be_refined_is_refused(scene, tmp_path, monkeypatch):
     capture, _ = scene(4)
     with pytest.raises(ValueError, match=r"is in .*capture, whose files are read: choose a folder outside"):
         refine(capture, capture / "new")
-    with pytest.raises(
-        ValueError, match="has no photographs beside its model: name the folder of the capture"
-    ):
-        refine(capture / "sparse/0", tmp_path / "new")
+    message = "has no photographs beside its model: name the folder of the capture"
+    refused(ValueError, message, refine, capture / "sparse/0", tmp_path / "new")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").write_text("")
     refused(FileExistsError, "full is not empty: choose another folder", refine, capture, tmp_path / "full")
@@ -160,13 +155,12 @@ def test_what_cannot_be_refined_is_refused(scene, tmp_path, monkeypatch):
     refused(FileNotFoundError, "none has no COLMAP model", refine, tmp_path / "none", tmp_path / "new")
     model = pycolmap.Reconstruction(capture / "sparse/0")
     (capture / "sparse/0/points3D.bin").rename(capture / "sparse/0/points3D.ply")
-    with pytest.raises(ValueError, match="does not say at which pixels photographs saw its points"):
-        refine(capture, tmp_path / "new")
+    message = "does not say at which pixels photographs saw its points"
+    refused(ValueError, message, refine, capture, tmp_path / "new")
     for number in list(model.points3D):
         model.delete_point3D(number)
     model.write(capture / "sparse/0")
-    with pytest.raises(ValueError, match="does not say at which pixels photographs saw its points"):
-        refine(capture, tmp_path / "new")
+    refused(ValueError, message, refine, capture, tmp_path / "new")
     monkeypatch.setattr("blitzgs.sfm.refine.has_pycolmap", lambda: False)
     refused(ImportError, r"pip install 'blitzgs\[sfm\]'", refine, capture, tmp_path / "new")
     assert not (tmp_path / "new").exists()
@@ -180,12 +174,9 @@ def test_a_model_appears_whole_and_alone(scene, tmp_path, monkeypatch):
         patch.setattr("blitzgs.sfm.refine.asdict", Mock(side_effect=KeyboardInterrupt))
         refine(capture, tmp_path / "new")
     assert not (tmp_path / "new/sparse").exists() and (tmp_path / "new/images").is_symlink()
-    with pytest.warns(UserWarning, match="of 2 COLMAP models, sparse/0 is refined, with 20 images"):
-        refine(capture, tmp_path / "new")
-    assert sorted(path.name for path in (tmp_path / "new/sparse").rglob("*")) == [
-        "0",
-        *(f"{name}.bin" for name in FILES),
-    ]
+    warned("of 2 COLMAP models, sparse/0 is refined, with 20 images", refine, capture, tmp_path / "new")
+    names = {path.name for path in (tmp_path / "new/sparse").rglob("*")}
+    assert names == {"0", *(f"{name}.bin" for name in FILES)}
 
 
 @pytest.mark.parametrize(("count", "away", "found"), [(20, 40, 40), (10, 40, 0), (20, 1, 0)])
@@ -227,7 +218,6 @@ def test_a_model_that_cannot_be_refined_is_kept(tmp_path, monkeypatch):
     )
     with (tmp_path / "lock").open("w") as lock:
         stage = (job, tmp_path / "colmap.log", lock.fileno(), lambda done, total: None)
-        with pytest.warns(UserWarning, match="principal point stays .* status 3: no CUDA"):
-            engine.run_stage("cameras", *stage)
+        warned("principal point stays .* status 3: no CUDA", engine.run_stage, "cameras", *stage)
         assert [path.name for path in (tmp_path / "models").iterdir()] == ["0"]
         refused(engine.StageError, "status 3: no CUDA", engine.run_stage, "pairs", *stage)

@@ -3,19 +3,27 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
-from blitzgs.capture.cameras import Float64, SourceView
+from blitzgs.capture.cameras import SourceView
 from blitzgs.capture.image_files import read_header
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.names import IMAGE_SUFFIXES, files_below, find_images, unified
+from blitzgs.capture.names import (
+    IMAGE_SUFFIXES,
+    any_case,
+    by_parts,
+    files_below,
+    find_images,
+    to_convert,
+    unified,
+)
 from blitzgs.capture.points import SUFFIXES, SourcePoints, file_points
 from blitzgs.capture.projects import Project
 from blitzgs.capture.projects.metashape import is_metashape, read_metashape
-from blitzgs.capture.projects.opensfm import NAME, read_opensfm
+from blitzgs.capture.projects.opensfm import NAME, ORIGINAL, read_opensfm
 from blitzgs.capture.projects.pix4d import SUFFIX, read_opf, read_pix4d
 from blitzgs.capture.projects.realitycapture import (
     is_bundler,
@@ -23,8 +31,8 @@ from blitzgs.capture.projects.realitycapture import (
     read_bundler,
     read_realitycapture,
 )
-from blitzgs.capture.world import WorldFrame, converted, frame_beside
-from blitzgs.util.errors import warn
+from blitzgs.capture.world import converted, frame_beside
+from blitzgs.util.errors import located, warn
 
 
 class FoundProject(NamedTuple):
@@ -42,19 +50,33 @@ _KINDS: tuple[tuple[str, tuple[str, ...], Callable[[Path], Project], Callable[[P
     ("OPF", ("*.opf", "*/*.opf"), read_opf, Path.is_file),
     ("Pix4D", tuple(f"{at}*{SUFFIX}" for at in _PARAMS), read_pix4d, Path.is_file),
     ("RealityCapture", ("*.csv",), read_realitycapture, is_realitycapture),
-    ("OpenSfM", (NAME, f"opensfm/{NAME}", "reconstruction.topocentric.json"), read_opensfm, Path.is_file),
+    ("OpenSfM", (NAME, f"opensfm/{NAME}", ORIGINAL), read_opensfm, Path.is_file),
     ("Bundler", ("*.out",), read_bundler, is_bundler),
 )
 # Folders above a project's file that may be the capture's: opensfm/, or 1_initial/params/.
 _FOLDERS_ABOVE = 3
 
 
-def project_at(path: Path) -> FoundProject | None:
-    """Return the project of a file; None: it is none."""
+def named_project(path: Path, images: str) -> tuple[Path, FoundProject]:
+    """Return the folder of the capture that the file of a project describes, and the project.
+
+    It is the nearest folder that has the images' folder. FileNotFoundError: the file is no project.
+    """
     for program, patterns, read, is_one in _KINDS:
         if any(PurePosixPath(path.name).match(Path(p).name) for p in patterns) and is_one(path):
-            return FoundProject(program, path, read)
-    return None
+            above = [path.parent, *path.parent.parents][:_FOLDERS_ABOVE]
+            root = next((folder for folder in above if (folder / images).is_dir()), path.parent)
+            return root, FoundProject(program, _original(path), read)
+    raise FileNotFoundError(
+        f"{path} is no project that can be read (docs/captures.md lists them): name the folder of the "
+        f"capture (images and a COLMAP model) with --data{to_convert([path.name])}"
+    )
+
+
+def _original(path: Path) -> Path:
+    """Return the file that OpenDroneMap kept when it moved a reconstruction, or the file itself."""
+    original = path.with_name(ORIGINAL)
+    return original if path.name == NAME and original.is_file() else path
 
 
 def find_project(root: Path) -> FoundProject | None:
@@ -66,22 +88,14 @@ def find_project(root: Path) -> FoundProject | None:
     found = [
         FoundProject(program, file, read)
         for program, patterns, read, is_one in _KINDS
-        for file in sorted({f for pattern in patterns for f in root.glob(pattern)})
+        for file in sorted({_original(f) for pattern in patterns for f in root.glob(pattern)})
         if file.is_file() and is_one(file)
     ]
-    files = {project.file for project in found}
-    found = [p for p in found if p.file.name == NAME or p.file.with_name(NAME) not in files]
     main = [project for project in found if project.read is not read_bundler] or found
     if len(main) > 1:
         shown = ", ".join(str(project.file.relative_to(root)) for project in main[:5])
         raise ValueError(f"{root} has {len(main)} projects ({shown}): name one of these files with --data")
     return main[0] if main else None
-
-
-def folder_of(file: Path, images: str) -> Path:
-    """Return the folder of the capture of a project's file: the nearest one that has the images' folder."""
-    above = [file.parent, *file.parent.parents][:_FOLDERS_ABOVE]
-    return next((folder for folder in above if (folder / images).is_dir()), file.parent)
 
 
 def read_project(
@@ -92,7 +106,8 @@ def read_project(
     FileNotFoundError: no photograph is there, so that the size of none is known. ValueError: the project is
     damaged.
     """
-    project = found.read(found.file)
+    with located(str(found.file)):
+        project = found.read(found.file)
     if not project.views:
         raise ValueError(
             f"{found.file} has no photograph with a pose: align the photographs, and export again"
@@ -126,19 +141,15 @@ def _relative(name: str) -> str:
 
 def _with_suffixes(folder: Path, root: Path, names: Sequence[str]) -> list[str]:
     """Complete names without a suffix, as Metashape's labels are (ValueError: several files fit one)."""
-    if all(PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES for name in names):
+    if all(name.lower().endswith(IMAGE_SUFFIXES) for name in names):
         return list(names)
     base = folder if folder.is_dir() else root
-    stems: defaultdict[str, list[str]] = defaultdict(list)
-    for file in files_below(base):
-        path = PurePosixPath(file)
-        if path.suffix.lower() in IMAGE_SUFFIXES:
-            for key in {str(path.with_suffix("")), path.stem}:
-                stems[key].append(file)
-    found = []
+    files = [file for file in files_below(base) if file.lower().endswith(IMAGE_SUFFIXES)]
+    known, found = by_parts(files), []
     for name in names:
-        fits = [] if PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES else stems.get(name, [])
-        fits = [file for file in fits if str(PurePosixPath(file).with_suffix("")) == name] or fits
+        key = any_case(name)
+        fits = [] if key.endswith(IMAGE_SUFFIXES) else [files[index] for index in known.get(key, [])]
+        fits = [file for file in fits if any_case(file).rpartition(".")[0] == key] or fits
         if len(fits) > 1:
             shown = ", ".join(fits[:3])
             raise ValueError(f"{base}: {len(fits)} files could be the photograph {name} ({shown}): keep one")
@@ -151,8 +162,7 @@ def _lenses(
 ) -> list[Lens]:
     if all(isinstance(view.lens, Lens) for view in project.views):
         return [view.lens for view in project.views if isinstance(view.lens, Lens)]
-    one = Lens("PINHOLE", 1, 1, (1.0, 1.0, 0.5, 0.5))
-    paths = find_images(root, images, names, [one] * len(names), 1)
+    paths = find_images(root, images, names, (), 1)
     sizes = [(h.width, h.height) if p.is_file() and (h := read_header(p)) else None for p in paths]
     common = Counter(size for size in sizes if size is not None).most_common(1)
     if not common:
@@ -161,63 +171,59 @@ def _lenses(
             f"(first: {names[0]}) is in {root / images}: put them there, or name their folder "
             "with --data.images=FOLDER"
         )
-    # A photograph that is missing is refused or left out later.
-    return [
-        view.lens if isinstance(view.lens, Lens) else view.lens(*(size or common[0][0]))
-        for view, size in zip(project.views, sizes, strict=True)
-    ]
-
-
-def _points(root: Path, found: FoundProject, project: Project, views: Sequence[SourceView]) -> SourcePoints:
-    if project.points is not None and len(project.points.positions):
-        return project.points
-    bundles = [file for file in sorted(root.glob("*.out")) if is_bundler(file) and file != found.file]
-    return points_beside(root, read_bundler(bundles[0]).points if bundles else None, project.frame, views)
+    lenses = []
+    for view, size in zip(project.views, sizes, strict=True):
+        with located(f"{found.file}: {view.name}"):
+            # A photograph that is missing is refused or left out later.
+            lenses.append(view.lens if isinstance(view.lens, Lens) else view.lens(*(size or common[0][0])))
+    return lenses
 
 
 # Points and views that are compared to find out in which coordinates points are.
 _SAMPLE, _VIEWS = 2000, 100
 
 
-def points_beside(
-    root: Path, own: SourcePoints | None, frame: WorldFrame | None, views: Sequence[SourceView]
-) -> SourcePoints:
+def _points(root: Path, found: FoundProject, project: Project, views: Sequence[SourceView]) -> SourcePoints:
     """Return the project's own points, or those of a file beside it, in the world of its cameras.
 
     Programs export cameras in coordinates of their own and points in those of a reference system, or both in
     one of the two: the coordinates in which the views see the points are taken.
     """
-    points = own
-    if points is None:
-        files = sorted(
-            path for path in root.iterdir() if path.suffix.lower() in (".ply", *SUFFIXES) and path.is_file()
-        )
-        named = [path for path in files if path.stem.lower() in ("points3d", "sparse_pc", "points")] or files
-        if len(named) != 1:
-            if named:
-                shown = ", ".join(path.name for path in named[:5])
-                warn(
-                    f"{root} has {len(named)} files of points ({shown}), and none is used: call one of them "
-                    f"points{named[0].suffix.lower()}"
-                )
-            return SourcePoints.none()
-        points = file_points(named[0])
-    choices = {"the project's own coordinates": points.positions}
+    if project.points is not None and len(project.points.positions):
+        return project.points
+    points = _points_beside(root, found)
+    frame, choices = project.frame, {"the project's own coordinates": points.positions}
     if frame is not None:
         choices[f"coordinates of {frame.name}"] = frame.from_world(points.positions)
         if points.crs is not None and frame.crs:
             moved = converted(points.positions, points.crs, frame.crs)
             choices[f"coordinates of {points.crs.name}"] = frame.from_world(moved)
-    seen = {name: seen_share(positions, views) for name, positions in choices.items()}
-    best = max(seen, key=seen.__getitem__)
+
+    def seen(name: str) -> int:
+        sample = choices[name][:: max(1, len(points.positions) // _SAMPLE)]
+        some = views[:: max(1, len(views) // _VIEWS)]
+        return sum(len(view.pixels_of(sample)) > 0 for view in some)
+
+    best = max(choices, key=seen)
     if best != next(iter(choices)):
         warn(f"{points.path}: the points are in {best}, and are moved to the cameras'")
     points.positions = choices[best]
     return points
 
 
-def seen_share(positions: Float64, views: Sequence[SourceView]) -> float:
-    """Return the share of views that see a point, of a sample of both."""
-    sample = positions[:: max(1, len(positions) // _SAMPLE)]
-    some = views[:: max(1, len(views) // _VIEWS)]
-    return sum(len(view.pixels_of(sample)) > 0 for view in some) / max(1, len(some))
+def _points_beside(root: Path, found: FoundProject) -> SourcePoints:
+    for bundle in sorted(root.glob("*.out")):
+        if is_bundler(bundle) and bundle != found.file:
+            with located(str(bundle)):
+                return read_bundler(bundle).points or SourcePoints.none()
+    files = sorted(p for p in root.iterdir() if p.suffix.lower() in (".ply", *SUFFIXES) and p.is_file())
+    named = [path for path in files if path.stem.lower() in ("points3d", "sparse_pc", "points")] or files
+    if len(named) == 1:
+        return file_points(named[0])
+    if named:
+        shown = ", ".join(path.name for path in named[:5])
+        warn(
+            f"{root} has {len(named)} files of points ({shown}), and none is used: call one of them "
+            f"points{named[0].suffix.lower()}"
+        )
+    return SourcePoints.none()

@@ -15,25 +15,18 @@ Conventions (Metashape User Manual, appendix on camera models; the format's own 
 from __future__ import annotations
 
 from pathlib import Path
+from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
+from xml.parsers import expat
 
 import numpy as np
 
+from blitzgs.capture.cameras import pose_of
+from blitzgs.capture.fields import image_size, number, numbers, read_bytes
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.projects import (
-    Project,
-    ProjectView,
-    check_rotation,
-    made_lens,
-    number,
-    numbers,
-    pose_of,
-    read_xml,
-    size_of,
-)
+from blitzgs.capture.projects import Project, ProjectView, made_lens, rotation_of
 from blitzgs.capture.world import GEOCENTRIC, WorldFrame
-
-_COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2", "b1", "b2")
+from blitzgs.util.errors import located
 
 
 def is_metashape(path: Path) -> bool:
@@ -45,35 +38,32 @@ def is_metashape(path: Path) -> bool:
 
 def read_metashape(path: Path) -> Project:
     """Read the chunk of an export of cameras; kinds that make no perspective image are refused."""
-    root = read_xml(path)
-    chunks = [chunk for chunk in root.iter("chunk") if chunk.find("cameras") is not None]
+    chunks = [chunk for chunk in _read_xml(path).iter("chunk") if chunk.find("cameras") is not None]
     if not chunks:
-        raise ValueError(f"{path}: there is no chunk with cameras: export the cameras of an aligned chunk")
+        raise ValueError("there is no chunk with cameras: export the cameras of an aligned chunk")
     if len(chunks) > 1:
-        raise ValueError(f"{path}: there are {len(chunks)} chunks with cameras: export one of them alone")
+        raise ValueError(f"there are {len(chunks)} chunks with cameras: export one of them alone")
     chunk = chunks[0]
     lenses: dict[str, Lens] = {}
     sensors = {str(sensor.get("id")): sensor for sensor in chunk.iter("sensor")}
     views: list[ProjectView] = []
-    components = []
-    cameras = [
-        camera
-        for camera in chunk.iter("camera")
-        if camera.find("transform") is not None and camera.get("enabled", "true") not in ("false", "0")
-    ]
-    for camera in cameras:
-        where = f"{path}: camera {camera.get('id')} ({camera.get('label')})"
+    components, others = [], []
+    for camera in chunk.iter("camera"):
+        if camera.find("transform") is None or camera.get("enabled", "true") in ("false", "0"):
+            others.append(camera)
+            continue
         label, sensor_id = camera.get("label"), str(camera.get("sensor_id"))
-        if not label or sensor_id not in sensors:
-            raise ValueError(f"{where}: no label, or its sensor {sensor_id} is not there; export it again")
+        with located(f"camera {camera.get('id')} ({label})"):
+            if not label or sensor_id not in sensors:
+                raise ValueError(f"no label, or its sensor {sensor_id} is not there; export it again")
+            matrix = numbers(_texts(camera), "transform", 16).reshape(4, 4)
+            pose = pose_of(rotation_of(matrix[:3, :3]), matrix[:3, 3])
         if sensor_id not in lenses:
-            lenses[sensor_id] = _lens(sensors[sensor_id], f"{path}: sensor {sensor_id}")
-        matrix = numbers(camera.findtext("transform"), 16, f"{where}: transform").reshape(4, 4)
-        views.append(ProjectView(label, lenses[sensor_id], pose_of(matrix[:3, :3], matrix[:3, 3], where)))
+            with located(f"sensor {sensor_id}"):
+                lenses[sensor_id] = _lens(sensors[sensor_id])
+        views.append(ProjectView(label, lenses[sensor_id], pose))
         components.append(camera.get("component_id"))
-    used = set(cameras)
-    others = [camera for camera in chunk.iter("camera") if camera not in used]
-    rigs = sum(camera.get("master_id") is not None for camera in others)
+    found, rigs = len(views), sum(camera.get("master_id") is not None for camera in others)
     every = sorted({component for component in components if component is not None})
     notes, main = [], max(every, key=components.count, default=None)
     if len(every) > 1:
@@ -83,46 +73,61 @@ def read_metashape(path: Path) -> Project:
         notes.append(f"{rigs} secondary cameras of a rig have no transform of their own and are left out")
     if any(sensor.find("rolling_shutter") is not None for sensor in sensors.values()):
         notes.append("the rolling shutter is not modelled")
-    lost = len(others) + len(cameras) - len(views)
-    return Project(views, None, _frame(chunk, main, path), lost, notes)
+    with located("transform"):
+        frame = _frame(chunk, main, path)
+    return Project(views, None, frame, len(others) + found - len(views), notes)
 
 
-def _lens(sensor: Element, where: str) -> Lens:
+def _read_xml(path: Path) -> Element:
+    """Return the root of an XML file.
+
+    Entities are refused: a few lines of them expand to gigabytes or name other files, and no project has one.
+    """
+    content, parser = read_bytes(path), expat.ParserCreate()
+
+    def refuse(*_: object) -> None:
+        raise ValueError("it defines entities, which no project needs")
+
+    parser.EntityDeclHandler = refuse
+    try:
+        parser.Parse(content, True)
+        return ElementTree.fromstring(content)
+    except (expat.ExpatError, ElementTree.ParseError, ValueError) as error:
+        line = parser.CurrentLineNumber
+        raise ValueError(f"line {line}: no readable XML ({error}); export the project again") from error
+
+
+def _texts(element: Element) -> dict[str, str | None]:
+    return {child.tag: child.text for child in element}
+
+
+def _lens(sensor: Element) -> Lens:
     kind = sensor.get("type", "frame")
     if kind not in ("frame", "fisheye"):
-        raise ValueError(
-            f"{where}: type {kind!r:.30} makes no perspective image: export undistorted images instead"
-        )
+        raise ValueError(f"type {kind!r:.30} makes no perspective image: export undistorted images instead")
     found = sensor.findall("calibration")
     adjusted = [c for c in found if c.get("class") == "adjusted"] or found
     if not adjusted:
-        raise ValueError(f"{where}: there is no calibration: align the photographs, and export again")
-    calibration = adjusted[0]
-    resolution = calibration.find("resolution")
+        raise ValueError("there is no calibration: align the photographs, and export again")
+    resolution = adjusted[0].find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
     if resolution is None:
-        raise ValueError(f"{where}: there is no resolution; export it again")
-    width, height = size_of(resolution.get("width"), resolution.get("height"), f"{where}: resolution")
-
-    def value(name: str, default: str | None = "0") -> float:
-        text = calibration.findtext(name, default)
-        if text is None:
-            raise ValueError(f"{where}: calibration has no {name}; export it again")
-        return number(text, f"{where}: {name}")
-
-    k1, k2, k3, k4, p1, p2, b1, b2 = (value(name) for name in _COEFFICIENTS)
-    # Old exports have fx and fy instead of f.
-    fy = value("f", None) if calibration.find("f") is not None else value("fy", None)
-    fx = fy + b1 if calibration.find("f") is not None else value("fx", None)
-    cx, cy = value("cx"), value("cy")
-    if calibration.find("f") is not None:
-        cx, cy = cx + width / 2, cy + height / 2
+        raise ValueError("there is no resolution; export it again")
+    width, height = size = image_size(resolution.attrib)
+    values = _texts(adjusted[0])
+    k1, k2, k3, k4, p1, p2, b1, b2, cx, cy = (
+        number(values, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2", "b1", "b2", "cx", "cy")
+    )
+    if "f" in values:
+        fy = number(values, "f")
+        fx, cx, cy = fy + b1, cx + width / 2, cy + height / 2
+    else:  # an old export
+        fx, fy = number(values, "fx"), number(values, "fy")
     if kind == "fisheye":
         if b2 != 0:
-            raise ValueError(f"{where}: a fisheye with the skew b2 = {b2:g} cannot be read: fix b2 to 0")
-        params = (fx, fy, cx, cy, k1, k2, p2, p1, k3, k4, 0.0, 0.0)
-        return made_lens(where, "THIN_PRISM_FISHEYE", width, height, *params)
-    return made_lens(where, "BROWN", width, height, fx, fy, cx, cy, k1, k2, k3, k4, p2, p1, b2 / fx)
+            raise ValueError(f"a fisheye with the skew b2 = {b2:g} cannot be read: fix b2 to 0")
+        return made_lens("THIN_PRISM_FISHEYE", size, fx, fy, cx, cy, k1, k2, p2, p1, k3, k4, 0, 0)
+    return made_lens("BROWN", size, fx, fy, cx, cy, k1, k2, k3, k4, p2, p1, b2 / fx if fx else 0.0)
 
 
 def _frame(chunk: Element, component: str | None, path: Path) -> WorldFrame | None:
@@ -130,17 +135,18 @@ def _frame(chunk: Element, component: str | None, path: Path) -> WorldFrame | No
     components = list(chunk.iter("component"))
     if component is not None or len(components) > 1:
         components = [c for c in components if c.get("id") == component]
-    owners = [*components, chunk]
-    transform = next((t for owner in owners if (t := owner.find("transform")) is not None), None)
+    transform = next(
+        (t for owner in (*components, chunk) if (t := owner.find("transform")) is not None), None
+    )
     if transform is None or transform.find("rotation") is None:
         return None
-    where = f"{path}: transform"
-    rotation = numbers(transform.findtext("rotation"), 9, f"{where}: rotation").reshape(3, 3)
-    check_rotation(rotation, where)
-    translation = numbers(transform.findtext("translation", "0 0 0"), 3, f"{where}: translation")
-    scale = number(transform.findtext("scale", "1"), f"{where}: scale")
+    values = {"translation": "0 0 0", **_texts(transform)}
+    rotation = rotation_of(numbers(values, "rotation", 9).reshape(3, 3))
     reference = (chunk.findtext("reference") or "").strip()
     local = not reference or reference.upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS"))
     # Rounded numbers of the file make the rotation one to about 1e-7 only.
     u, _, vt = np.linalg.svd(rotation)
-    return WorldFrame("" if local else GEOCENTRIC, scale, u @ vt, translation, path.name)
+    translation = numbers(values, "translation", 3)
+    return WorldFrame(
+        "" if local else GEOCENTRIC, number(values, "scale", 1.0), u @ vt, translation, path.name
+    )

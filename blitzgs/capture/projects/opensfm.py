@@ -22,23 +22,14 @@ from typing import Any
 import cv2
 import numpy as np
 
+from blitzgs.capture.fields import entry, image_size, number, numbers, read_json, read_small
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.points import SourcePoints
-from blitzgs.capture.projects import (
-    Project,
-    ProjectView,
-    entry,
-    made_lens,
-    number,
-    numbers,
-    pose_of,
-    read_json,
-    size_of,
-)
-from blitzgs.capture.world import WorldFrame, enu_frame, read_small, utm_of_text
+from blitzgs.capture.projects import Project, ProjectView, made_lens
+from blitzgs.capture.world import WorldFrame, enu_frame, utm_of_text
+from blitzgs.util.errors import located
 
-NAME = "reconstruction.json"
-_ORIGINAL = "reconstruction.topocentric.json"
+NAME, ORIGINAL = "reconstruction.json", "reconstruction.topocentric.json"
 _MODELS = {
     "perspective": ("BROWN", ("k1", "k2")),
     "simple_radial": ("BROWN", ("k1",)),
@@ -51,53 +42,47 @@ _MODELS = {
 
 def read_opensfm(path: Path) -> Project:
     """Read the largest reconstruction of a file."""
-    original = path.with_name(_ORIGINAL)
-    path = original if path.name == NAME and original.is_file() else path
     content = read_json(path)
     if not isinstance(content, list) or not all(isinstance(part, Mapping) for part in content) or not content:
-        raise ValueError(f"{path}: expected a list of reconstructions; run OpenSfM again")
-    counts = [len(entry(part, "shots", dict, str(path))) for part in content]
+        raise ValueError("expected a list of reconstructions; run OpenSfM again")
+    counts = [len(entry(part, "shots", dict)) for part in content]
     best = content[int(np.argmax(counts))]
     notes = []
     if len(content) > 1:
         notes.append(
             f"of {len(content)} reconstructions, the largest is used: {max(counts)} of {sum(counts)} shots"
         )
-    lenses = {
-        key: _lens(camera, f"{path}: camera {key!r:.60}")
-        for key, camera in entry(best, "cameras", dict, str(path)).items()
-    }
+    lenses: dict[str, Lens] = {}
+    for key, camera in entry(best, "cameras", dict).items():
+        with located(f"camera {key!r:.60}"):
+            lenses[key] = _lens(camera)
     views = []
     for name, shot in best["shots"].items():
-        where = f"{path}: shot {name!r:.60}"
-        key = entry(shot, "camera", str, where)
-        if key not in lenses:
-            raise ValueError(f"{where}: its camera {key!r:.60} is not there")
-        vector = numbers(shot.get("rotation"), 3, f"{where}: rotation")
-        rotation = np.asarray(cv2.Rodrigues(vector)[0], dtype=np.float64)
-        translation = numbers(shot.get("translation"), 3, f"{where}: translation")
-        views.append(ProjectView(name, lenses[key], pose_of(rotation.T, -rotation.T @ translation, where)))
+        with located(f"shot {name!r:.60}"):
+            key = entry(shot, "camera", str)
+            if key not in lenses:
+                raise ValueError(f"its camera {key!r:.60} is not there")
+            pose = np.eye(4)
+            pose[:3, :3] = cv2.Rodrigues(numbers(shot, "rotation", 3))[0]
+            pose[:3, 3] = numbers(shot, "translation", 3)
+        views.append(ProjectView(name, lenses[key], pose))
     return Project(views, _points(best, path), _frame(path, best), sum(counts) - max(counts), notes)
 
 
-def _lens(camera: Any, where: str) -> Lens:
-    kind = entry(camera, "projection_type", str, where)
+def _lens(camera: Any) -> Lens:
+    kind = entry(camera, "projection_type", str)
     if kind not in _MODELS:
-        raise ValueError(f"{where}: projection_type {kind!r:.30} cannot be read; known: {', '.join(_MODELS)}")
+        raise ValueError(f"projection_type {kind!r:.30} cannot be read; known: {', '.join(_MODELS)}")
     model, known = _MODELS[kind]
-    width, height = size_of(camera.get("width"), camera.get("height"), where)
+    width, height = size = image_size(camera)
     side = max(width, height)
-
-    def value(key: str, default: float | None = None) -> float:
-        return number(camera.get(key, default), f"{where}: {key}")
-
-    fx = value("focal_x" if "focal_x" in camera else "focal")
-    fy = value("focal_y") if "focal_y" in camera else fx
-    k = {key: value(key, 0.0) for key in known}
-    head = (fx * side, fy * side, width / 2 + value("c_x", 0.0) * side, height / 2 + value("c_y", 0.0) * side)
-    radial = [k.get(key, 0.0) for key in ("k1", "k2", "k3", "k4")]
-    rest = [k.get("p1", 0.0), k.get("p2", 0.0), 0.0] if model == "BROWN" else []
-    return made_lens(where, model, width, height, *head, *radial, *rest)
+    fx = number(camera, "focal_x" if "focal_x" in camera else "focal")
+    fy = number(camera, "focal_y", fx)
+    cx, cy = (number(camera, key, 0.0) for key in ("c_x", "c_y"))
+    k = {key: number(camera, key, 0.0) for key in known}
+    head = (fx * side, fy * side, width / 2 + cx * side, height / 2 + cy * side)
+    last = ("p1", "p2", "skew") if model == "BROWN" else ()
+    return made_lens(model, size, *head, *(k.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", *last)))
 
 
 def _points(part: Mapping[str, Any], path: Path) -> SourcePoints:
@@ -107,7 +92,7 @@ def _points(part: Mapping[str, Any], path: Path) -> SourcePoints:
         colors = np.array([p.get("color", (128, 128, 128)) for p in points], dtype=np.float64)
         colors = np.clip(np.nan_to_num(colors.reshape(len(points), 3)), 0, 255)
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: points: expected three coordinates and colours each ({error})") from error
+        raise ValueError(f"points: expected three coordinates and colours each ({error})") from error
     return SourcePoints(positions, colors.astype(np.uint8), path=path, colors_from="the points' own colours")
 
 
@@ -116,12 +101,13 @@ def _frame(path: Path, part: Mapping[str, Any]) -> WorldFrame | None:
     if path.name == NAME and coords.is_file():
         return _odm_offset(coords)
     beside = path.with_name("reference_lla.json")
-    reference = read_json(beside) if beside.is_file() else part.get("reference_lla")
-    if not isinstance(reference, Mapping):
-        return None
-    where = beside.name if beside.is_file() else path.name
-    place = [number(reference.get(key), f"{where}: {key}") for key in ("latitude", "longitude", "altitude")]
-    return enu_frame(place[0], place[1], place[2], where)
+    source = beside.name if beside.is_file() else path.name
+    with located(source):
+        reference = read_json(beside) if beside.is_file() else part.get("reference_lla")
+        if not isinstance(reference, Mapping):
+            return None
+        place = [number(reference, key) for key in ("latitude", "longitude", "altitude")]
+    return enu_frame(place[0], place[1], place[2], source)
 
 
 def _odm_offset(path: Path) -> WorldFrame:
@@ -130,8 +116,8 @@ def _odm_offset(path: Path) -> WorldFrame:
     crs = utm_of_text(lines[0]) if len(lines) == 2 else ""
     if not crs:
         raise ValueError(f"{path}: line 1: expected a zone such as 'WGS84 UTM 33N'; run OpenDroneMap again")
-    offset = numbers(lines[1], None, f"{path}: line 2")
-    if len(offset) < 2:
-        raise ValueError(f"{path}: line 2: expected east and north, got {lines[1]!r:.40}")
-    translation = np.array([offset[0], offset[1], 0.0])
-    return WorldFrame(crs, translation=translation, source="coords.txt of OpenDroneMap")
+    try:
+        east, north = (float(word) for word in lines[1].split()[:2])
+    except ValueError as error:
+        raise ValueError(f"{path}: line 2: expected east and north, got {lines[1]!r:.40}") from error
+    return WorldFrame(crs, translation=np.array([east, north, 0.0]), source="coords.txt of OpenDroneMap")

@@ -26,25 +26,18 @@ from urllib.parse import unquote, urlparse
 
 import numpy as np
 
-from blitzgs.capture.cameras import Float64
+from blitzgs.capture.cameras import pose_of
+from blitzgs.capture.fields import entry, image_size, number, numbers, read_json, read_text
 from blitzgs.capture.lens import Lens
-from blitzgs.capture.projects import (
-    Project,
-    ProjectView,
-    entry,
-    made_lens,
-    number,
-    numbers,
-    pose_of,
-    read_json,
-    read_text,
-    size_of,
-)
+from blitzgs.capture.projects import Project, ProjectView, made_lens, rotation_of, turn
 from blitzgs.capture.world import WorldFrame, read_offset
+from blitzgs.util.errors import located
 
 SUFFIX = "_calibrated_camera_parameters.txt"
-# Lines of a camera: name and size, K, radial, tangential, position, R.
-_LINES = 10
+# Lines of a camera after the first one, which has its name and size.
+_K, _R = ("K, row 1", "K, row 2", "K, row 3"), ("R, row 1", "R, row 2", "R, row 3")
+_LINES = (*_K, "radial distortion", "tangential distortion", "camera position", *_R)
+_DISTORTION = (("radial", 3), ("tangential", 2))
 
 
 def read_pix4d(path: Path) -> Project:
@@ -52,31 +45,27 @@ def read_pix4d(path: Path) -> Project:
     lines = [line.strip() for line in read_text(path).splitlines()]
     begin = next((i for i, line in enumerate(lines) if line.startswith("camera model")), None)
     if begin is None:
-        raise ValueError(f"{path}: no header that ends in 'camera model ...'; export it again")
-    kept = [(number, line) for number, line in enumerate(lines[begin + 1 :], start=begin + 2) if line]
-    if len(kept) % _LINES:
-        raise ValueError(f"{path}: {len(kept)} lines are not {_LINES} for each camera: it is cut off")
+        raise ValueError("no header that ends in 'camera model ...'; export it again")
+    kept = [(place, line) for place, line in enumerate(lines[begin + 1 :], start=begin + 2) if line]
+    count = 1 + len(_LINES)
+    if len(kept) % count:
+        raise ValueError(f"{len(kept)} lines are not {count} for each camera: it is cut off")
     views = []
-    for first in range(0, len(kept), _LINES):
+    for first in range(0, len(kept), count):
         place, head = kept[first]
-        where = f"{path}: line {place}"
-        words = head.rsplit(maxsplit=2)
-        if len(words) != 3:
-            raise ValueError(f"{where}: expected a name, a width and a height, got {head!r:.60}")
-        width, height = size_of(words[1], words[2], where)
-        rows = [
-            numbers(line, count, f"{path}: line {number}")
-            for (number, line), count in zip(
-                kept[first + 1 : first + _LINES], (3, 3, 3, 3, 2, 3, 3, 3, 3), strict=True
-            )
-        ]
-        k, radial, tangential, position, rotation = rows[:3], rows[3], rows[4], rows[5], np.stack(rows[6:])
-        fx, skew, cx = k[0]
-        _, fy, cy = k[1]
-        lens = made_lens(
-            where, "BROWN", width, height, fx, fy, cx, cy, *radial, 0.0, *tangential, skew / fx if fx else 0.0
-        )
-        views.append(ProjectView(words[0], lens, pose_of(rotation.T, position, where)))
+        with located(f"line {place}"):
+            words = head.rsplit(maxsplit=2)
+            if len(words) != 3:
+                raise ValueError(f"expected a name, a width and a height, got {head!r:.60}")
+            rest = zip(_LINES, kept[first + 1 : first + count], strict=True)
+            fields = {"width": words[1], "height": words[2], **{name: line for name, (_, line) in rest}}
+            (fx, skew, cx), (_, fy, cy), _ = (numbers(fields, row, 3) for row in _K)
+            radial, tangential = (numbers(fields, f"{kind} distortion", n) for kind, n in _DISTORTION)
+            distortion = (*radial, 0.0, *tangential, skew / fx if fx else 0.0)
+            lens = made_lens("BROWN", image_size(fields), fx, fy, cx, cy, *distortion)
+            rotation = np.stack([numbers(fields, row, 3) for row in _R])
+            pose = pose_of(rotation_of(rotation.T), numbers(fields, "camera position", 3))
+        views.append(ProjectView(words[0], lens, pose))
     return Project(views, None, _frame(path))
 
 
@@ -89,68 +78,61 @@ def _frame(path: Path) -> WorldFrame | None:
 def read_opf(path: Path) -> Project:
     """Read the calibrated cameras of a project."""
     files = _resources(path)
-    content = {
-        kind: _content(path, files, kind) for kind in ("calibrated-cameras", "input-cameras", "camera-list")
-    }
-    calibrated = content["calibrated-cameras"]
-    where = str(files["calibrated-cameras"])
-    listed = content["camera-list"]
-    names = {entry(c, "id", int, str(files["camera-list"])): c for c in _list(listed, "cameras", path)}
-    sizes = {
-        entry(sensor, "id", int, str(files["input-cameras"])): sensor
-        for sensor in _list(content["input-cameras"], "sensors", path)
-    }
-    lenses: dict[int, Lens] = {}
-    for sensor in _list(calibrated, "sensors", path):
-        key = entry(sensor, "id", int, where)
-        if key not in sizes:
-            raise ValueError(f"{where}: the sensor {key} is not in {files['input-cameras'].name}")
-        size = numbers(
-            sizes[key].get("image_size_px"), 2, f"{files['input-cameras']}: sensor {key}: image_size_px"
-        )
-        lenses[key] = _lens(sensor, *size_of(size[0], size[1], where), f"{where}: sensor {key}")
-    views = []
-    for camera in _list(calibrated, "cameras", path):
-        key = entry(camera, "id", int, where)
-        at = f"{where}: camera {key}"
-        sensor_id = entry(camera, "sensor_id", int, at)
-        if sensor_id not in lenses or key not in names:
-            raise ValueError(f"{at}: its sensor {sensor_id} or its photograph is not in the project's lists")
-        rotation = _rotation(numbers(camera.get("orientation_deg"), 3, f"{at}: orientation_deg"))
-        position = numbers(camera.get("position"), 3, f"{at}: position")
-        name = _photograph(entry(names[key], "uri", str, at))
-        views.append(ProjectView(name, lenses[sensor_id], pose_of(rotation, position, at)))
+    for kind in ("calibrated-cameras", "input-cameras", "camera-list"):
+        if kind not in files:
+            raise ValueError(
+                f"the project has no application/opf-{kind}+json: export it after the calibration"
+            )
+    with located(files["camera-list"].name):
+        listed = entry(read_json(files["camera-list"]), "cameras", list)
+        names = {entry(camera, "id", int): _photograph(entry(camera, "uri", str)) for camera in listed}
+    with located(files["input-cameras"].name):
+        given = read_json(files["input-cameras"])
+        sizes = {}
+        for sensor in entry(given, "sensors", list):
+            key = entry(sensor, "id", int)
+            with located(f"sensor {key}"):
+                side = numbers(sensor, "image_size_px", 2).tolist()
+                sizes[key] = image_size({"width": side[0], "height": side[1]})
+        shots = sum(len(entry(shot, "cameras", list)) for shot in entry(given, "captures", list))
+    with located(files["calibrated-cameras"].name):
+        calibrated = read_json(files["calibrated-cameras"])
+        lenses = {}
+        for sensor in entry(calibrated, "sensors", list):
+            key = entry(sensor, "id", int)
+            with located(f"sensor {key}"):
+                if key not in sizes:
+                    raise ValueError(f"it is not in {files['input-cameras'].name}")
+                lenses[key] = _lens(sensor, sizes[key])
+        views = []
+        for camera in entry(calibrated, "cameras", list):
+            key = entry(camera, "id", int)
+            with located(f"camera {key}"):
+                sensor = entry(camera, "sensor_id", int)
+                if sensor not in lenses or key not in names:
+                    raise ValueError(f"its sensor {sensor} or its photograph is not in the project's lists")
+                omega, phi, kappa = numbers(camera, "orientation_deg", 3)
+                # Of axes right, up and backwards; ours are right, down and forward.
+                rotation = turn("x", omega) @ turn("y", phi) @ turn("z", kappa) * [1, -1, -1]
+                pose = pose_of(rotation, numbers(camera, "position", 3))
+            views.append(ProjectView(names[key], lenses[sensor], pose))
     rolls = any("rolling_shutter" in camera for camera in calibrated["cameras"])
     notes = ["the rolling shutter is not modelled"] if rolls else []
-    lost = sum(len(_list(c, "cameras", path)) for c in _list(content["input-cameras"], "captures", path))
-    return Project(views, None, _opf_frame(path, files), max(0, lost - len(views)), notes)
+    return Project(views, None, _opf_frame(files), max(0, shots - len(views)), notes)
 
 
 def _resources(path: Path) -> dict[str, Path]:
     """Return the first file of each kind that a project names."""
     files: dict[str, Path] = {}
-    for item in _list(read_json(path), "items", path):
-        for resource in _list(item, "resources", path):
-            uri, kind = entry(resource, "uri", str, str(path)), entry(resource, "format", str, str(path))
+    for item in entry(read_json(path), "items", list):
+        for resource in entry(item, "resources", list):
+            uri, kind = entry(resource, "uri", str), entry(resource, "format", str)
             name = kind.removeprefix("application/opf-").removesuffix("+json")
             file = path.parent / unquote(urlparse(uri).path)
             if not file.resolve().is_relative_to(path.parent.resolve()):
-                raise ValueError(f"{path}: {uri!r:.80} leads outside the project: put the file beside it")
+                raise ValueError(f"{uri!r:.80} leads outside the project: put the file beside it")
             files.setdefault(name, file)
     return files
-
-
-def _content(path: Path, files: Mapping[str, Path], kind: str) -> Any:
-    if kind not in files:
-        raise ValueError(
-            f"{path}: the project has no application/opf-{kind}+json: export it after the calibration"
-        )
-    return read_json(files[kind])
-
-
-def _list(content: Any, key: str, path: Path) -> list[Any]:
-    found: list[Any] = entry(content, key, list, str(path))
-    return found
 
 
 def _photograph(uri: str) -> str:
@@ -161,36 +143,27 @@ def _photograph(uri: str) -> str:
     return name.rpartition("/")[2] if absolute else name
 
 
-def _rotation(degrees: Float64) -> Float64:
-    """Return camera to world for axes right, down, forward."""
-    (so, sp, sk), (co, cp, ck) = np.sin(np.radians(degrees)), np.cos(np.radians(degrees))
-    about_x = np.array([[1, 0, 0], [0, co, -so], [0, so, co]])
-    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    about_z = np.array([[ck, -sk, 0], [sk, ck, 0], [0, 0, 1]])
-    return np.asarray(about_x @ about_y @ about_z * [1, -1, -1])
-
-
-def _lens(sensor: Any, width: int, height: int, where: str) -> Lens:
-    internals = entry(sensor, "internals", dict, where)
-    kind = entry(internals, "type", str, where)
+def _lens(sensor: Any, size: tuple[int, int]) -> Lens:
+    internals = entry(sensor, "internals", dict)
+    kind = entry(internals, "type", str)
     if kind != "perspective":
-        raise ValueError(f"{where}: {kind!r:.20} cameras cannot be read: export undistorted images instead")
-    f = number(internals.get("focal_length_px"), f"{where}: focal_length_px")
-    cx, cy = numbers(internals.get("principal_point_px"), 2, f"{where}: principal_point_px")
-    radial = numbers(internals.get("radial_distortion"), 3, f"{where}: radial_distortion")
-    tangential = numbers(internals.get("tangential_distortion"), 2, f"{where}: tangential_distortion")
-    return made_lens(where, "BROWN", width, height, f, f, cx, cy, *radial, 0.0, *tangential, 0.0)
+        raise ValueError(f"{kind!r:.20} cameras cannot be read: export undistorted images instead")
+    f = number(internals, "focal_length_px")
+    cx, cy = numbers(internals, "principal_point_px", 2)
+    radial, tangential = (numbers(internals, f"{kind}_distortion", n) for kind, n in _DISTORTION)
+    return made_lens("BROWN", size, f, f, cx, cy, *radial, 0.0, *tangential, 0.0)
 
 
-def _opf_frame(path: Path, files: Mapping[str, Path]) -> WorldFrame | None:
+def _opf_frame(files: Mapping[str, Path]) -> WorldFrame | None:
     """Return the similarity from the processing frame to the project's reference system."""
     if "scene-reference-frame" not in files:
         return None
     file = files["scene-reference-frame"]
-    content = read_json(file)
-    crs = entry(entry(content, "crs", dict, str(file)), "definition", str, str(file))
-    transform = entry(content, "base_to_canonical", dict, str(file))
-    shift, scale = (numbers(transform.get(key), 3, f"{file}: {key}") for key in ("shift", "scale"))
+    with located(file.name):
+        content = read_json(file)
+        crs = entry(entry(content, "crs", dict), "definition", str)
+        transform = entry(content, "base_to_canonical", dict)
+        shift, scale = (numbers(transform, key, 3) for key in ("shift", "scale"))
     if transform.get("swap_xy") or not np.allclose(scale, scale[0], rtol=1e-9):
         # Mirrored axes and heights in another unit are no similarity; the canonical frame is one.
         return WorldFrame(translation=-shift, source=f"{file.name}, with x east and y north in metres")

@@ -28,18 +28,12 @@ from pathlib import Path
 
 import numpy as np
 
-from blitzgs.capture.cameras import Float64
+from blitzgs.capture.cameras import Float64, pose_of
+from blitzgs.capture.fields import number, read_bytes, read_text
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.points import SourcePoints
-from blitzgs.capture.projects import (
-    Project,
-    ProjectView,
-    check_size,
-    made_lens,
-    number,
-    pose_of,
-    read_text,
-)
+from blitzgs.capture.projects import Project, ProjectView, made_lens, rotation_of, turn
+from blitzgs.util.errors import located
 
 _NEEDED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 # Newer versions write these names.
@@ -72,37 +66,28 @@ def read_realitycapture(path: Path) -> Project:
     for place, row in enumerate(rows, start=first + 2):
         if not row or row[0].startswith("#"):
             continue
-        where = f"{path}: line {place}"
-        if len(row) != len(columns):
-            raise ValueError(f"{where}: {len(row)} values in {len(columns)} columns; export it again")
-        cells = dict(zip(columns, row, strict=True))
-        values = {key: number(cells[key], f"{where}: {key}") for key in columns if key in _NUMBERS}
-        rotation = _rotation(values["heading"], values["pitch"], values["roll"])
-        centre = [values["x"], values["y"], values["alt"]]
-        lens = functools.partial(_lens, values, where)
-        views.append(ProjectView(cells["name"].strip(), lens, pose_of(rotation, centre, where)))
+        with located(f"line {place}"):
+            if len(row) != len(columns):
+                raise ValueError(f"{len(row)} values in {len(columns)} columns; export it again")
+            cells = dict(zip(columns, row, strict=True))
+            values = {key: number(cells, key) for key in columns if key in _NUMBERS}
+            # Of axes right, up and backwards; ours are right, down and forward.
+            rotation = turn("z", -values["heading"]) @ turn("x", values["pitch"]) @ turn("y", values["roll"])
+            pose = pose_of(rotation * [1, -1, -1], [values["x"], values["y"], values["alt"]])
+        views.append(ProjectView(cells["name"].strip(), functools.partial(_lens, values), pose))
     return Project(views)
 
 
 _NUMBERS = (*_NEEDED[1:], "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 
 
-def _rotation(heading: float, pitch: float, roll: float) -> Float64:
-    """Return camera to world for axes right, down, forward."""
-    h, p, r = np.radians([-heading, pitch, roll])
-    about_z = np.array([[np.cos(h), -np.sin(h), 0], [np.sin(h), np.cos(h), 0], [0, 0, 1]])
-    about_x = np.array([[1, 0, 0], [0, np.cos(p), -np.sin(p)], [0, np.sin(p), np.cos(p)]])
-    about_y = np.array([[np.cos(r), 0, np.sin(r)], [0, 1, 0], [-np.sin(r), 0, np.cos(r)]])
-    return np.asarray(about_z @ about_x @ about_y * [1, -1, -1])
-
-
-def _lens(values: dict[str, float], where: str, width: int, height: int) -> Lens:
+def _lens(values: dict[str, float], width: int, height: int) -> Lens:
     side = max(width, height)
     f = values["f"] / 36 * side
     cx = width / 2 + values.get("px", 0) * side
     cy = height / 2 + values.get("py", 0) * side
-    k1, k2, k3, k4, t1, t2 = (values.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "t1", "t2"))
-    return made_lens(where, "BROWN", width, height, f, f, cx, cy, k1, k2, k3, k4, t2, t1, 0)
+    coefficients = (values.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "t2", "t1"))
+    return made_lens("BROWN", (width, height), f, f, cx, cy, *coefficients, 0.0)
 
 
 _SIGN = b"# Bundle file v0.3"
@@ -116,43 +101,37 @@ def is_bundler(path: Path) -> bool:
 
 def read_bundler(path: Path) -> Project:
     """Read cameras and points."""
-    check_size(path)
-    with open(path, "rb") as file:
-        file.readline()
-        counts = file.readline().split()
-        body = file.read()
+    _, head, *lines = read_bytes(path).split(b"\n")
     try:
-        cameras, points = (int(word) for word in counts)
-        if not (0 <= cameras <= len(body) and 0 <= points <= len(body)):
+        cameras, points = (int(word) for word in head.split())
+        if not (0 <= cameras <= len(lines) and 0 <= points <= len(lines)):
             raise ValueError
     except ValueError as error:
-        raise ValueError(f"{path}: line 2: expected the numbers of cameras and points") from error
-    lines = body.splitlines()
+        raise ValueError("line 2: expected the numbers of cameras and points") from error
     if len(lines) < 5 * cameras + 3 * points:
         raise ValueError(
-            f"{path}: {len(lines) + 2} lines are too few for {cameras} cameras and {points} points: the file "
-            "is cut off; export it again"
+            f"{len(lines) + 2} lines are too few for {cameras} cameras and {points} points: the file is cut "
+            "off; export it again"
         )
     try:
         rows = np.array(b" ".join(lines[: 5 * cameras]).split(), dtype=np.float64).reshape(cameras, 15)
     except ValueError as error:
-        raise ValueError(f"{path}: the cameras are not 15 numbers each ({error}); export it again") from error
+        raise ValueError(f"the cameras are not 15 numbers each ({error}); export it again") from error
     names = _names(path, cameras)
     views = []
     for index, row in enumerate(rows):
         if row[0] == 0:  # not registered
             continue
-        where = f"{path}: camera {index} ({names[index]})"
         rotation = row[3:12].reshape(3, 3)
-        centre = -rotation.T @ row[12:15]
-        lens = functools.partial(_bundle_lens, row[:3], where)
-        views.append(ProjectView(names[index], lens, pose_of(rotation.T * [1, -1, -1], centre, where)))
+        with located(f"camera {index} ({names[index]})"):
+            pose = pose_of(rotation_of(rotation.T * [1, -1, -1]), -rotation.T @ row[12:15])
+        views.append(ProjectView(names[index], functools.partial(_bundle_lens, row[:3]), pose))
     return Project(views, _points(path, lines[5 * cameras :], points), lost=cameras - len(views))
 
 
-def _bundle_lens(values: Float64, where: str, width: int, height: int) -> Lens:
+def _bundle_lens(values: Float64, width: int, height: int) -> Lens:
     f, k1, k2 = values
-    return made_lens(where, "RADIAL", width, height, f, width / 2, height / 2, k1, k2)
+    return made_lens("RADIAL", (width, height), f, width / 2, height / 2, k1, k2)
 
 
 def _names(path: Path, count: int) -> list[str]:
@@ -160,14 +139,14 @@ def _names(path: Path, count: int) -> list[str]:
     beside += sorted(path.parent.glob("*list*.txt"))
     found = next((file for file in beside if file.is_file()), None)
     if found is None:
-        raise ValueError(f"{path} has no list of its photographs: put list.txt, one name a line, beside it")
+        raise ValueError("it has no list of its photographs: put list.txt, one name a line, beside it")
     # A line may have a focal length after the name.
     names = [line.strip() for line in read_text(found).splitlines() if line.strip()]
     names = [
         name if len(words := name.rsplit(maxsplit=2)) < 3 or words[1] != "0" else words[0] for name in names
     ]
     if len(names) != count:
-        raise ValueError(f"{found} has {len(names)} names for the {count} cameras of {path}: they must agree")
+        raise ValueError(f"{found} has {len(names)} names for its {count} cameras: they must agree")
     return names
 
 
@@ -177,9 +156,7 @@ def _points(path: Path, lines: list[bytes], count: int) -> SourcePoints:
         colors = np.array(b" ".join(lines[1 : 3 * count : 3]).split(), dtype=np.float64).reshape(count, 3)
         tracks = np.array([int(line.split(None, 1)[0]) for line in lines[2 : 3 * count : 3]], dtype=np.int64)
     except (ValueError, IndexError) as error:
-        raise ValueError(
-            f"{path}: a point has not three lines of numbers ({error}); export it again"
-        ) from error
+        raise ValueError(f"a point has not three lines of numbers ({error}); export it again") from error
     return SourcePoints(
         positions,
         np.clip(colors, 0, 255).astype(np.uint8),
