@@ -68,8 +68,7 @@ class ActiveRows(NamedTuple):
 def morton_keys(points: Tensor) -> Tensor:
     """Return each point's position along the Morton curve of the cloud's bounding cube.
 
-    `points`: float32 [N, 3]. Returns int64 [N]; 2^63 - 1 for a point that is not finite. RuntimeError: wrong
-    shape or dtype.
+    `points`: float32 [N, 3]. Returns int64 [N]; 2^63 - 1 for a point that is not finite.
     """
     return torch.ops.blitzgs.morton_keys(points)
 
@@ -86,9 +85,6 @@ def update_block_bounds_(
         means: float32 [N, 3].
         scales: float32 [N, 3], logarithms of the standard deviations.
         pending: bounds how far rows may move when pending steps are applied; None: there are none.
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes.
     """
     with below_autograd():
         torch.ops.blitzgs.update_block_bounds_(bounds, ids, _rows(means, scales, pending))
@@ -135,7 +131,7 @@ def cull_blocks(
             blocks as the views may see; the host then waits for this number.
 
     Raises:
-        RuntimeError: wrong shapes or dtypes, more than 32 views, or as `gate_views_` says.
+        RuntimeError: as `gate_views_`.
     """
     ids, views, length, blocks = torch.ops.blitzgs.cull_blocks(
         bounds,
@@ -163,8 +159,7 @@ def gate_views_(active: ActiveRows, means: Tensor, viewmats: Tensor, rules: Gate
         rules: which rows each view leaves out.
 
     Raises:
-        RuntimeError: wrong shapes or dtypes, more than 32 views, no level, finer levels that reach farther,
-            or a column that the cull matrix lacks.
+        RuntimeError: no level, finer levels that reach farther, or a column that the cull matrix lacks.
     """
     level, reach, lod_views, cull, columns = rules
     with below_autograd():
@@ -193,19 +188,13 @@ def sectors_of_rows(rows: Tensor) -> Tensor:
     Returns:
         int32 [ceil(N / 256), 32 words, 8]: for each block of 256 rows and column the 32 bytes of the rows'
         bits; bit r % 32 of word r / 32 is that of the block's row r. Rows beyond N have zeros.
-
-    Raises:
-        RuntimeError: a wrong shape or dtype.
     """
     return torch.ops.blitzgs.sectors_of_rows(rows)
 
 
 @torch.no_grad()
 def rows_of_sectors(sectors: Tensor, n: int) -> Tensor:
-    """Convert a mask of N rows back to the layout by row, int32 [N, words]; the inverse of `sectors_of_rows`.
-
-    RuntimeError: a wrong shape or dtype.
-    """
+    """Convert a mask of N rows back to the layout by row, int32 [N, words]: undo `sectors_of_rows`."""
     return torch.ops.blitzgs.rows_of_sectors(sectors, n)
 
 

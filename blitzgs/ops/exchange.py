@@ -35,10 +35,7 @@ def scatter_splats(
     Raises:
         RuntimeError: columns of different lengths, or too many.
     """
-    packed, places = torch.ops.blitzgs.scatter_splats(
-        [words_of(c) for c in columns], masks, list(group_sizes)
-    )
-    return packed, places
+    return torch.ops.blitzgs.scatter_splats([words_of(c) for c in columns], masks, list(group_sizes))
 
 
 def gather_splats(packed: Tensor, like: Sequence[Tensor], group_sizes: Sequence[int]) -> list[Tensor]:
@@ -99,12 +96,8 @@ def tile_costs(sums: Tensor, first: int, views: int, grain: int) -> list[Tensor]
 
     Returns:
         For each view float16 [ceil(T / grain)], at most 65504, in memory of its own.
-
-    Raises:
-        RuntimeError: wrong shapes, dtypes or numbers.
     """
-    costs: list[Tensor] = torch.ops.blitzgs.tile_costs(sums, first, views, grain)
-    return costs
+    return torch.ops.blitzgs.tile_costs(sums, first, views, grain)
 
 
 def divide_tiles(
@@ -126,8 +119,5 @@ def divide_tiles(
     Returns:
         M + 1 ascending bounds, 0 and B T included; each is the one nearest to its share of the total, the
         later one of two.
-
-    Raises:
-        RuntimeError: wrong shapes, dtypes or numbers.
     """
     return tuple(torch.ops.blitzgs.divide_tiles(costs, similar, tiles, grain, tile_cost, parts))

@@ -47,13 +47,12 @@ def splat_contributions(
         sums of the squares int64 [P], in the same units (each square rounded down), or [0] if not asked for.
 
     Raises:
-        RuntimeError: wrong shapes or dtypes, a tile range outside the images, or a tile size that CUDA lacks.
+        RuntimeError: a tile range outside the images, or a tile size that CUDA lacks.
     """
-    sums: tuple[Tensor, Tensor, Tensor] = torch.ops.blitzgs.contributions(
+    return torch.ops.blitzgs.contributions(
         means2d, conics, splat_opacities, isect_splats, tile_offsets,
         n_cameras, width, height, tile_size, tile_begin, tile_end, n_splats, squares,
     )  # fmt: skip
-    return sums
 
 
 # How many times a weight is divided by the square root of its number of pixels, for each score rule.
@@ -99,9 +98,6 @@ def view_sums_(
         rule: score rule, a key of `DIVISIONS`.
         eps: added to the number of pixels.
         unit: unit of the score; division by a power of two is exact.
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes, too many views, or a column outside the matrix.
     """
     torch.ops.blitzgs.view_sums_(
         list(sums), list(splats), weights, pixels, counts, list(columns), DIVISIONS[rule], eps, unit
@@ -145,7 +141,7 @@ def pixel_splats(
             order.
 
     Raises:
-        RuntimeError: wrong shapes or dtypes, or a tile size that CUDA lacks.
+        RuntimeError: a tile size that CUDA lacks.
     """
     slots, rows, n_rows = None, None, n_cameras * height * width
     if pixels is not None:
@@ -197,10 +193,7 @@ class MassCut(NamedTuple):
         )
 
     def take_steps(self, share: tuple[int, int], first: int, last: int) -> None:
-        """Run the steps `first` to `last` - 1; `share` is a numerator and a denominator of at most 10^9.
-
-        RuntimeError: wrong shapes, dtypes or numbers.
-        """
+        """Run the steps `first` to `last` - 1; `share` is a numerator and a denominator of at most 10^9."""
         torch.ops.blitzgs.mass_cut_(
             *self.items, self.searches, self.sums, self.listed, self.chosen, *share, first, last
         )

@@ -91,5 +91,4 @@ def intersect(
     """
     splats = (means2d, conics, splat_opacities, depths, camera_ids, ids)
     grid = TileGrid(n_cameras, width, height, tile_size, tile_begin, tile_end)
-    lists: tuple[Tensor, Tensor] = torch.ops.blitzgs.intersect(*splats, *grid, n_isects, n_splats)
-    return lists
+    return torch.ops.blitzgs.intersect(*splats, *grid, n_isects, n_splats)

@@ -75,7 +75,7 @@ class _Saved(NamedTuple):
     @classmethod
     def of(cls, ctx: Any) -> _Saved:
         """Read them. Call this once: checkpointing recomputes saved tensors at each reading."""
-        *tensors, viewmats, Ks, camera_ids, visible_ids, splat_offsets, level, ids = ctx.saved_tensors  # noqa: N806
+        *tensors, viewmats, Ks, camera_ids, visible_ids, splat_offsets, level, ids = ctx.saved_tensors
         return cls(tensors, (viewmats, Ks), (camera_ids, visible_ids, splat_offsets), level, ids)
 
 
@@ -176,7 +176,7 @@ class _Project(torch.autograd.Function):
 
 
 def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-    gaussians, viewmats, Ks, *others = inputs  # noqa: N806
+    gaussians, viewmats, Ks, *others = inputs
     options = ProjectionOptions(*others[6 : 6 + N_OPTIONS])
     # To torch an empty list of numbers is one of tensors, which has an empty list of gradients.
     ctx.no_gradients = [[] if isinstance(x, (list, tuple)) and not x else None for x in (Ks, *others)]
@@ -302,7 +302,7 @@ def differentiable_splats(
     `sparse_grad`: see `project`. `splats`: the result of `project_splats` for these inputs, if it is already
     known. `rows`: the visible rows of these inputs, if `splats` got their colours from them.
     """
-    viewmats, Ks = inputs.cameras  # noqa: N806
+    viewmats, Ks = inputs.cameras
     if not torch.compiler.is_compiling():
         splats = project_splats(inputs) if splats is None else splats
         tables = inputs.gaussians if rows is None else [*inputs.gaussians, *rows.sh]

@@ -85,8 +85,7 @@ def first_rows(columns: Sequence[Tensor], lengths: Sequence[int]) -> list[Tensor
     Autograd does not see that these are views: a Function may return views, but its caller could not change
     them in place.
     """
-    found: list[Tensor] = torch.ops.blitzgs.first_rows(columns, lengths)
-    return found
+    return torch.ops.blitzgs.first_rows(columns, lengths)
 
 
 class Splats(NamedTuple):

@@ -112,9 +112,6 @@ def sum_splats(
 
     Returns:
         [P, width] each; zero for splats that went nowhere. Deterministic.
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes.
     """
     return torch.ops.blitzgs.sum_splats(values, places, list(group_sizes), splats, list(widths))
 
