@@ -44,7 +44,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TILE_COST, TileOwners
 from blitzgs.frame.render import RenderOptions
 from blitzgs.frame.tiles import LOSS_HALO, TileRanges
-from blitzgs.frame.transport import Traffic, stages_told_to
+from blitzgs.frame.transport.protocol import Traffic, stages_told_to
 from blitzgs.ops.projection_types import Views
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import octree_gaussians

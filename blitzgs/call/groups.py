@@ -20,7 +20,7 @@ from blitzgs.call.channels import ImageOptions, channels_of
 from blitzgs.call.covariances import Decomposed, shaped_by
 from blitzgs.call.layout import CUDA_TILE_SIZE, Lists
 from blitzgs.frame.render import run_attempts
-from blitzgs.frame.transport.protocol import LocalExchange, LocalTransport
+from blitzgs.frame.transport.protocol import Exchange, LocalTransport
 from blitzgs.ops.project import TableRows, differentiable_splats, project_splats
 from blitzgs.ops.projection_types import (
     MAX_VIEWS,
@@ -204,7 +204,7 @@ def render_queued(
     needed = [t for t in read if t is not None and t.requires_grad] if torch.is_grad_enabled() else []
     backward_follows = len(needed) > 0 and not image.absgrad
 
-    def attempt(capacity: Sizes | None) -> tuple[LocalExchange, tuple[LocalExchange, list[Tensor]]]:
+    def attempt(capacity: Sizes | None) -> tuple[Exchange, list[Tensor]]:
         exchange = transport.project_and_send(inputs, None, capacity)
         _, n_splats, n_isects = exchange.arrived
         projected, has_spare = exchange.projected, n_splats is not None
@@ -220,11 +220,10 @@ def render_queued(
             channels, image.render_mode != "RGB", rows_of, sh, *inputs.cameras, *options,
             image.backgrounds, n_isects, backward_follows, projected.totals if has_spare else None,
         )  # fmt: skip
-        return exchange, (exchange, outputs)
+        return exchange, outputs
 
-    result, (exchange, outputs) = run_attempts(transport, attempt)
-    assert exchange.totals is not None
-    splats, (visible, count, isects, *rest) = result.projected, exchange.totals
+    result, outputs = run_attempts(transport, attempt)
+    splats, (visible, count, isects, *rest) = result.projected, result.totals
     isect_splats, tile_offsets, *images = outputs[: _LISTS + _IMAGES]
     of_rows = outputs[_LISTS + _IMAGES :]
     if isect_splats.shape[0] > isects or (of_rows and of_rows[1].shape[0] > visible):

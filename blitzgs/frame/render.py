@@ -21,16 +21,16 @@ from torch import Tensor
 
 from blitzgs._library import below_autograd
 from blitzgs.frame.tiles import TileAssignment
-from blitzgs.frame.transport import (
+from blitzgs.frame.transport import open_transport
+from blitzgs.frame.transport.protocol import (
     Arrived,
     Exchange,
+    ExchangeResult,
     Traffic,
     Transport,
     WayBack,
-    open_transport,
     stage_ended,
 )
-from blitzgs.frame.transport.protocol import ExchangeResult
 from blitzgs.ops.blocks import ActiveRows, GateRules
 from blitzgs.ops.intersect import TileGrid
 from blitzgs.ops.projection_types import (
@@ -242,17 +242,11 @@ def backward_splats(frame: Frame, v_renders: Tensor) -> SplatGradients:
     grid = TileGrid(len(views), views.width, views.height, options.tile_size, *tiles)
     if way_back is not None:
         way_back.check_still_valid()
-    if v_renders.is_cuda:
-        table = frame.gradients.take(frame.splats.means2d)
-        torch.ops.blitzgs.rasterize_bwd(
-            *frame.saved, v_renders, None, *grid, False, options.deterministic, table
-        )
-        gradients = SplatGradients([table])
-    else:
-        *parts, _ = torch.ops.blitzgs.rasterize_bwd(
-            *frame.saved, v_renders, None, *grid, False, options.deterministic
-        )
-        gradients = SplatGradients(parts)
+    table = frame.gradients.take(frame.splats.means2d) if v_renders.is_cuda else None
+    *parts, _ = torch.ops.blitzgs.rasterize_bwd(
+        *frame.saved, v_renders, None, *grid, False, options.deterministic, table
+    )
+    gradients = SplatGradients(parts if table is None else [table])
     stage_ended("raster back")
     if way_back is not None:
         gradients = way_back.return_gradients(gradients)

@@ -17,7 +17,8 @@ from blitzgs.distributed.shared_memory import MAX_VALUES, SharedMemory, control_
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.render import backward_splats, render_frame
 from blitzgs.frame.tiles import TileAssignment
-from blitzgs.frame.transport import CollectiveTransport, PeerTransport
+from blitzgs.frame.transport.collective import CollectiveTransport
+from blitzgs.frame.transport.peer import PeerTransport
 from blitzgs.frame.transport.protocol import CapacityEstimate
 from blitzgs.ops.splat_gradients import SplatGradients, gradient_columns
 from blitzgs.optim.table_adam import TableAdam
