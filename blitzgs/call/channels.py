@@ -141,9 +141,9 @@ def _rows(splats: ProjectedSplats, gaussians: Gaussians, per_view: bool, with_sp
     rows = splats.gaussian_ids
     if len(gaussians.scenes) > 1 or per_view:
         images = splats.camera_ids.long()
-        rows = (images if per_view else images // gaussians.views) * gaussians.count + rows
+        rows = (images if per_view else images // gaussians.views) * gaussians.n_gaussians + rows
     if with_spare:
-        length = len(gaussians.scenes) * gaussians.count * (gaussians.views if per_view else 1)
+        length = len(gaussians.scenes) * gaussians.n_gaussians * (gaussians.views if per_view else 1)
         rows = rows.clamp(0, length - 1)
     return rows
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from functools import reduce
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from blitzgs.call.arguments import Gaussians, Scene, Signals
+from blitzgs.call.arguments import Gaussians
 from blitzgs.call.bad_values import CamerasOnHost, check_intrinsics, watch_for_non_finite
 from blitzgs.call.channels import ImageOptions, channels_of, split_channels
 from blitzgs.call.extras import Pixels
@@ -35,7 +35,6 @@ _CHANNELS_AT_A_TIME = 64
 
 
 def render(
-    function: str,
     gaussians: Gaussians,
     projection: ProjectionOptions,
     image: ImageOptions,
@@ -46,7 +45,6 @@ def render(
     """Render images; return the results of `blitzgs.rasterization`.
 
     Args:
-        function: name of the public function, for warnings.
         projection: options of the projection.
         image: options of compositing.
         tables: the SH, if only the rows of visible Gaussians are read; only where `groups_may_be_queued`.
@@ -67,7 +65,7 @@ def render(
     else:
         cameras = None if compiling else CamerasOnHost(gaussians)
         splats = project_groups(groups, image.sparse_grad)
-    layout = Layout(splats, (*gaussians.lead, gaussians.opacities.shape[-1]), image.packed)
+    layout = Layout(splats, (*gaussians.lead, gaussians.n_gaussians), image.packed)
     # As in gsplat, Gaussians without a splat have their own opacity.
     over_all = not (image.packed or projection.antialiased or image.sparse_grad)
     arranged = layout.rendered_columns(gaussians.opacities if over_all else None)
@@ -101,7 +99,7 @@ def render(
         if queued is not None and queued.has_blank_view:
             check_intrinsics(gaussians.named["Ks"])
             suspects_cameras = True
-        watch_for_non_finite(gaussians, layout, function, nan_marks, suspects_cameras)
+        watch_for_non_finite(gaussians, layout, nan_marks, suspects_cameras)
     median = _median_depths(rendered, composited_lists, images, image.pixels) if image.median else None
     renders, alphas, others = _images_of_caller(renders, alphas, median, gaussians, image, lead)
     arrived = None if job is None else rendered
@@ -156,42 +154,34 @@ def _median_depths(splats: ProjectedSplats, lists: Lists, images: int, pixels: P
     return depths.view(-1, 1) if pixels is not None else depths.view(images, lists.height, lists.width, 1)
 
 
-def _nan_or_zero(scene: Scene, valued: bool, signals: Signals | None) -> Tensor:
-    """Return [N]: NaN for a Gaussian with a colour or signal, in some view, that is not finite, 0 for others.
-
-    `valued`: whether its colours are values. `signals`: describes its extra signals.
-    """
-    tables = []
-    if valued:
-        assert scene.colors is not None
-        tables.append(scene.colors)
-    if signals is not None:
-        assert scene.extra_signals is not None
-        values = scene.extra_signals
-        if signals.sh_degree is not None:
-            values = values[:, : (signals.sh_degree + 1) ** 2].flatten(1)
-        tables.append(values)
-    totals = []
-    for table in tables:
-        # Zero times a number is zero unless the number is NaN or infinite. The product of a few channels at a
-        # time needs little memory.
-        parts = [(part * 0).sum(dim=-1) for part in table.detach().split(_CHANNELS_AT_A_TIME, dim=-1)]
-        total = parts[0] if len(parts) == 1 else torch.stack(parts).sum(dim=0)
-        totals.append(total if total.dim() == 1 else total.sum(dim=0))
-    return totals[0] if len(totals) == 1 else totals[0] + totals[1]
+def _nan_or_zero(table: Tensor) -> Tensor:
+    """Return [N] for a table [N, D] or [C, N, D]: NaN for a row with a value that is not finite, else 0."""
+    # Zero times a number is zero unless the number is NaN or infinite. The product of a few channels at a
+    # time needs little memory.
+    parts = [(part * 0).sum(dim=-1) for part in table.detach().split(_CHANNELS_AT_A_TIME, dim=-1)]
+    total = parts[0] if len(parts) == 1 else torch.stack(parts).sum(dim=0)
+    return total if total.dim() == 1 else total.sum(dim=0)
 
 
 def _without_non_finite(gaussians: Gaussians) -> tuple[Gaussians, list[Tensor]]:
     """Set the opacity of Gaussians to 0 whose colours or signals are not finite: NaN reaches no pixel.
 
-    SH are left to the projection. Also returns `_nan_or_zero` of each scene, or an empty list.
+    SH colours are left to the projection. Also returns for each scene [N], NaN for these Gaussians and 0 for
+    others; or an empty list.
     """
-    valued = gaussians.colors is not None and gaussians.sh_degree is None
-    if not valued and gaussians.signals is None:
+    columns, signals = [], gaussians.signals
+    if gaussians.colors is not None and gaussians.sh_degree is None:
+        columns.append(gaussians.named["colors"])
+    if signals is not None:
+        values = gaussians.named["extra_signals"]
+        if signals.sh_degree is not None:
+            values = tuple(own[:, : (signals.sh_degree + 1) ** 2].flatten(1) for own in values)
+        columns.append(values)
+    if not columns:
         return gaussians, []
-    nan_marks = [_nan_or_zero(scene, valued, gaussians.signals) for scene in gaussians.scenes]
-    scenes = [
+    nan_marks = [reduce(torch.add, map(_nan_or_zero, tables)) for tables in zip(*columns, strict=True)]
+    scenes = tuple(
         scene._replace(opacities=scene.opacities.masked_fill(value.isnan(), 0))
         for scene, value in zip(gaussians.scenes, nan_marks, strict=True)
-    ]
-    return replace(gaussians, scenes=tuple(scenes)), nan_marks
+    )
+    return gaussians._replace(scenes=scenes), nan_marks

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -61,17 +60,17 @@ def gather_views(
         return gaussians, None
     job = CallRanks(Ranks(dist.get_rank(), dist.get_world_size()), gaussians.views)
     scene, recorded = gaussians.scenes[0], torch.is_grad_enabled()
-    inputs = scene._replace(Ks=scene.means)  # Ks get no gradient
-    need = recorded and any(t is not None and t.requires_grad for t in inputs[:8])
+    extra = None if gaussians.signals is None else gaussians.signals.values
+    learned = (scene.means, scene.quats, scene.scales, scene.opacities, scene.colors, extra)
     need_poses = recorded and scene.viewmats.requires_grad
-    channels = None if gaussians.colors is None else gaussians.colors.shape[-1]
-    signals = None if gaussians.signals is None else gaussians.signals.channels
-    own = (gaussians.views, *same, channels, signals, need, need_poses)
+    need = need_poses or (recorded and any(t is not None and t.requires_grad for t in learned))
+    channels = [None if t is None else t.shape[-1] for t in (scene.colors, extra)]
+    own = (gaussians.views, *same, *channels, need, need_poses)
     _require_same(own, job.ranks, scene.viewmats.device)
     viewmats = _all_poses(scene.viewmats, job)
     Ks = torch.cat(job.ranks.all_gather(scene.Ks.detach().contiguous()))
     scene = scene._replace(viewmats=viewmats, Ks=Ks)
-    return replace(gaussians, scenes=(scene,), lead=(len(viewmats),)), job
+    return gaussians._replace(scenes=(scene,), lead=(len(viewmats),)), job
 
 
 def _require_same(given: tuple[Any, ...], ranks: Ranks, device: torch.device) -> None:

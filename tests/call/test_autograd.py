@@ -10,7 +10,7 @@ import torch.utils.checkpoint
 from torch._dynamo.testing import CompileCounterWithBackend
 
 import blitzgs
-from blitzgs.call.bad_values import _warn_of_gradient
+from blitzgs.call.arguments import warn_of_gradient
 from blitzgs.ops.photometric import photometric_loss
 from blitzgs.reference.projection import covariance_factors
 from tests.call.test_raw_rasterization import raw, raw_parameters
@@ -188,7 +188,7 @@ def test_an_argument_may_have_the_negative_bit(device, name):
 
 @pytest.mark.parametrize("render", [rasterize_scene, render_raw], ids=["rasterization", "raw_rasterization"])
 def test_intrinsics_that_require_a_gradient_are_named_once(render, recwarn):
-    _warn_of_gradient.cache_clear()
+    warn_of_gradient.cache_clear()
     scene = random_scene(n=20)
     for tensor in (scene.means, scene.Ks):
         tensor.requires_grad_()

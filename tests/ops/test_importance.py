@@ -142,7 +142,7 @@ def test_bad_arguments_are_named():
         splat_contributions(splats[0], splats[1][:, :2], splats[2], *lists, **grid)
     with pytest.raises(RuntimeError, match="tile_begin and tile_end must be a range"):
         splat_contributions(*splats, *lists, **grid, tile_begin=5, tile_end=99)
-    with pytest.raises(ValueError, match="rasterize_mode must be 'classic' or 'antialiased', got 'ewa'"):
+    with pytest.raises(ValueError, match="rasterize_mode must be one of classic, antialiased, got 'ewa'"):
         blitzgs.contributions(*splats, splats[2], *lists, 4, 4, rasterize_mode="ewa")
 
 

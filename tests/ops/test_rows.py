@@ -4,7 +4,6 @@
 import pytest
 import torch
 
-import blitzgs.call.bad_values  # noqa: F401  (registers the fake kernel)
 from blitzgs.call.layout import Places
 from blitzgs.ops.exchange import PLACE_SPLATS, gather_splats, scatter_splats
 from blitzgs.ops.projection_types import first_rows
