@@ -21,6 +21,7 @@ from blitzgs.call.covariances import Decomposed, shaped_by
 from blitzgs.call.layout import CUDA_TILE_SIZE, Lists
 from blitzgs.frame.render import run_attempts
 from blitzgs.frame.transport.protocol import Exchange, LocalTransport
+from blitzgs.ops.intersect import TileGrid
 from blitzgs.ops.project import TableRows, differentiable_splats, project_splats
 from blitzgs.ops.projection_types import (
     MAX_VIEWS,
@@ -236,8 +237,8 @@ def render_queued(
         splats = splats._replace(colors=colors)
         rows = TableRows(inputs._replace(gaussians=found), numbers, indices, sh)
     has_blank_view = 0 in rest[VIEW_TOTALS - 3 :]
-    lists = Lists(isect_splats, tile_offsets, options.width, options.height, options.tile_size)
-    return Rendered(splats, lists, images, rows, has_blank_view)
+    grid = TileGrid(inputs.n_views, options.width, options.height, options.tile_size)
+    return Rendered(splats, Lists(isect_splats, tile_offsets, grid), images, rows, has_blank_view)
 
 
 @lru_cache(maxsize=16)

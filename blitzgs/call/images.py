@@ -65,12 +65,12 @@ def render(
     else:
         cameras = None if compiling else CamerasOnHost(gaussians)
         splats = project_groups(groups, image.sparse_grad)
-    layout = Layout(splats, (*gaussians.lead, gaussians.n_gaussians), image.packed)
     # As in gsplat, Gaussians without a splat have their own opacity.
     over_all = not (image.packed or projection.antialiased or image.sparse_grad)
-    arranged = layout.rendered_columns(gaussians.opacities if over_all else None)
+    under = gaussians.opacities if over_all else None
+    layout = Layout(splats, (*gaussians.lead, gaussians.n_gaussians), image.packed, under)
     rendered, meta_geometry = layout.splats_to_composite(
-        arranged, gathered=compiling or job is not None, depths=image.render_mode != "RGB" or image.median
+        gathered=compiling or job is not None, depths=image.render_mode != "RGB" or image.median
     )
     channels = rendered.colors if only_colors else channels_of(rendered, gaussians, image)
     lead = gaussians.lead
@@ -87,9 +87,8 @@ def render(
         lists, composited_lists = lists_of(rendered, images, projection, count, image.pixels)
     renders, alphas = rasterize(
         rendered.means2d, rendered.conics, rendered.opacities, channels,
-        composited_lists.splats, composited_lists.offsets, n_cameras=images, width=projection.width,
-        height=projection.height, tile_size=composited_lists.tile_size, backgrounds=image.backgrounds,
-        store_absgrad=layout.absgrad_store(arranged["means2d"]) if image.absgrad else None,
+        composited_lists.splats, composited_lists.offsets, **composited_lists.grid._asdict(),
+        backgrounds=image.backgrounds, store_absgrad=layout.absgrad_store() if image.absgrad else None,
         composited=None if queued is None else queued.composited, meta_geometry=meta_geometry,
     )  # fmt: skip
     if not compiling:
@@ -100,10 +99,10 @@ def render(
             check_intrinsics(gaussians.named["Ks"])
             suspects_cameras = True
         watch_for_non_finite(gaussians, layout, nan_marks, suspects_cameras)
-    median = _median_depths(rendered, composited_lists, images, image.pixels) if image.median else None
+    median = _median_depths(rendered, composited_lists, image.pixels) if image.median else None
     renders, alphas, others = _images_of_caller(renders, alphas, median, gaussians, image, lead)
     arrived = None if job is None else rendered
-    return renders, alphas, make_meta(gaussians, layout, {**arranged, **others}, lists, lead, arrived)
+    return renders, alphas, make_meta(gaussians, layout, others, lists, lead, arrived)
 
 
 def _images_of_caller(
@@ -141,17 +140,17 @@ def _images_of_caller(
     return renders, alphas, others
 
 
-def _median_depths(splats: ProjectedSplats, lists: Lists, images: int, pixels: Pixels | None) -> Tensor:
+def _median_depths(splats: ProjectedSplats, lists: Lists, pixels: Pixels | None) -> Tensor:
     """Return the depth of the splat at which half the light of each pixel is gone, [I, H, W, 1] or [M, 1]."""
+    n_cameras, width, height, tile_size, *_ = lists.grid
     found = pixel_splats(
-        splats.means2d, splats.conics, splats.opacities, lists.splats, lists.offsets, n_cameras=images,
-        width=lists.width, height=lists.height, tile_size=lists.tile_size,
-        pixels=None if pixels is None else pixels.numbers,
+        splats.means2d, splats.conics, splats.opacities, lists.splats, lists.offsets, n_cameras=n_cameras,
+        width=width, height=height, tile_size=tile_size, pixels=None if pixels is None else pixels.numbers,
     )  # fmt: skip
     # Before the first splat stands the depth of a pixel without splats.
     table = torch.cat([splats.depths.new_zeros(1), splats.depths])
     depths = table.index_select(0, found.medians + 1)
-    return depths.view(-1, 1) if pixels is not None else depths.view(images, lists.height, lists.width, 1)
+    return depths.view(-1, 1) if pixels is not None else depths.view(n_cameras, height, width, 1)
 
 
 def _nan_or_zero(table: Tensor) -> Tensor:
