@@ -165,7 +165,7 @@ class Layout:
         return splats, MetaGeometry(places.arrange, geometry)
 
     def absgrad_store(self) -> Callable[[Tensor], None]:
-        """Set means2d's `absgrad` to 0; return a function that fills it with the splats' gradients, [P, 2]."""
+        """Zero means2d's `absgrad`; return a function that fills it with the splats' gradients, [P, 2]."""
         absgrad = torch.zeros_like(self.rendered["means2d"])
         self.rendered["means2d"].absgrad = absgrad  # type: ignore[attr-defined]
 

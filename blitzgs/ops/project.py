@@ -181,11 +181,8 @@ def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
     # To torch an empty list of numbers is one of tensors, which has an empty list of gradients.
     ctx.no_gradients = [[] if isinstance(x, (list, tuple)) and not x else None for x in (Ks, *others)]
     *columns, _, _ = output
-    _save(
-        ctx,
-        ProjectionInputs(gaussians, (viewmats, Ks), options, level=others[5]),
-        ProjectedSplats._make((*columns, None)),
-    )
+    inputs = ProjectionInputs(gaussians, (viewmats, Ks), options, level=others[5])
+    _save(ctx, inputs, ProjectedSplats._make((*columns, None)))
 
 
 def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
@@ -266,14 +263,11 @@ def project(
     """
     if active_views is not None and active_ids is None:
         active_ids = torch.arange(len(means), dtype=torch.int32, device=means.device)
-    inputs = ProjectionInputs(
-        gaussian_tensors(means, quats, scales, opacities, sh),
-        (viewmats, Ks),
-        ProjectionOptions(
-            width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw
-        ),
-        [tensor for tensor in (active_ids, active_views) if tensor is not None],
+    options = ProjectionOptions(
+        width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw
     )
+    gaussians = gaussian_tensors(means, quats, scales, opacities, sh)
+    inputs = ProjectionInputs(gaussians, (viewmats, Ks), options, (active_ids, active_views))
     return differentiable_splats(inputs, sparse_grad)
 
 
