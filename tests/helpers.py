@@ -193,6 +193,18 @@ def ssim_map(x: Tensor, y: Tensor, padding: int = 5) -> Tensor:
     return (top / ((mx * mx + my * my + 0.01**2) * (vx + vy + 0.03**2))).permute(0, 2, 3, 1)
 
 
+def on_threads(call: Callable[[], Any], counts: Iterable[int] = (1, 2, 3)) -> list[Any]:
+    """Return what a call returns with each of these numbers of torch's threads."""
+    before, results = torch.get_num_threads(), []
+    try:
+        for count in counts:
+            torch.set_num_threads(count)
+            results.append(call())
+    finally:
+        torch.set_num_threads(before)
+    return results
+
+
 def refused(error: type[Exception], text: str, call: Callable, /, *given: Any, **named: Any) -> None:
     """Check that a call raises an error of this kind, whose message the regular expression matches."""
     with pytest.raises(error, match=text):

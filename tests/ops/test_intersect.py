@@ -6,7 +6,7 @@ import torch
 
 from blitzgs.ops.intersect import intersect, tile_counts
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT
-from tests.helpers import DEVICES, needs_cuda, refused
+from tests.helpers import DEVICES, needs_cuda, on_threads, refused
 from tests.ops.splats import Splats, kept_by, pixel_alphas, random_splats, with_capacity
 
 WIDTH, HEIGHT = 91, 70
@@ -119,14 +119,7 @@ def test_tile_ranges_are_parts_of_the_whole():
 
 def test_does_not_depend_on_threads():
     splats = random_splats(5000, WIDTH, HEIGHT)
-    threads = torch.get_num_threads()
-    results = []
-    try:
-        for count in (1, 2, 3):
-            torch.set_num_threads(count)
-            results.append(intersect(*splats.geometry(), n_cameras=1, width=WIDTH, height=HEIGHT))
-    finally:
-        torch.set_num_threads(threads)
+    results = on_threads(lambda: intersect(*splats.geometry(), n_cameras=1, width=WIDTH, height=HEIGHT))
     assert all(torch.equal(a, b) for r in results[1:] for a, b in zip(results[0], r, strict=True))
 
 
