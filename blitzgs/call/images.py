@@ -44,12 +44,9 @@ def render(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render images; return the results of `blitzgs.rasterization`.
 
-    Args:
-        projection: options of the projection.
-        image: options of compositing.
-        tables: the SH, if only the rows of visible Gaussians are read; only where `groups_may_be_queued`.
-        job: the ranks among which the Gaussians and views are divided; None: this process has all of them.
-        groups: `groups_of` the Gaussians, which have SH, if they are already known.
+    `tables`: the SH, if only the rows of visible Gaussians are read; only where `groups_may_be_queued`.
+    `job`: the ranks among which the Gaussians and views are divided; None: this process has all of them.
+    `groups`: `groups_of` the Gaussians, which have SH, if they are already known.
     """
     compiling = torch.compiler.is_compiling()
     nan_marks: list[Tensor] = []
@@ -115,11 +112,8 @@ def _images_of_caller(
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """Return images and alphas as the caller asked for them, and the further images of `meta` by key.
 
-    Args:
-        renders: all channels, [I, H, W, channels].
-        alphas: [I, H, W].
-        median: median depths, [I, H, W, 1] or of M pixels [M, 1]; None: not asked for.
-        lead: batch dimensions, and the number of views that are rendered here.
+    `renders`: all channels, [I, H, W, channels]. `alphas`: [I, H, W]. `median`: median depths, [I, H, W, 1]
+    or of M pixels [M, 1]. `lead`: batch dimensions, and the number of views that are rendered here.
     """
     alphas = alphas.unsqueeze(-1)
     if image.pixels is not None:

@@ -198,11 +198,9 @@ def lists_of(
 ) -> tuple[Lists, Lists]:
     """Return the tile lists for meta, and those to composite.
 
-    Args:
-        projection: the size of the images, and the caller's tile size.
-        count: number of entries of the lists for meta; -1: unknown.
-        pixels: the pixels that are rendered: the lists of tiles without any are empty, and those of the
-            others are as in the whole image, so that these pixels have the same bits. None: all.
+    `count`: number of entries of the lists for meta; -1: unknown. `pixels`: the pixels that are rendered: the
+    lists of tiles without any are empty, and those of the others are as in the whole image, so that these
+    pixels have the same bits. None: all.
     """
 
     def listed_by(edge: int, n_isects: int) -> Lists:

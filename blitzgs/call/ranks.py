@@ -33,22 +33,12 @@ class CallRanks(NamedTuple):
 def gather_views(
     gaussians: Gaussians, absgrad: bool, same: Sequence[Any]
 ) -> tuple[Gaussians, CallRanks | None]:
-    """Return this rank's Gaussians with the views of all ranks, M C, in the order of ranks.
+    """Return this rank's Gaussians with the views of all ranks, M C, in the order of ranks. Collective.
 
-    Collective.
-
-    Args:
-        gaussians: one scene, with the rank's own views.
-        absgrad: whether absolute gradients are asked for, which ranks do not exchange.
-        same: values that must be equal on all ranks.
-
-    Returns:
-        The Gaussians, and the job; None if there is one rank.
-
-    Raises:
-        ValueError: there are batch dimensions, colours per view or absolute gradients; or, on every rank: the
-            ranks differ in `same`, in their number of views, or in whether
-            Gaussians or poses need gradients. Some ranks would then wait for others forever.
+    `gaussians`: one scene, with the rank's own views. `same`: values that must be equal on all ranks. Also
+    returns the job; None if there is one rank. ValueError: there are batch dimensions, colours per view or
+    absolute gradients, which ranks do not exchange; or, on every rank: the ranks differ in `same`, in their
+    number of views, or in whether Gaussians or poses need gradients, and would wait for others forever.
     """
     per_view = gaussians.per_view or (gaussians.signals is not None and gaussians.signals.per_view)
     if len(gaussians.lead) > 1 or per_view or absgrad:

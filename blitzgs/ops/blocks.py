@@ -84,7 +84,7 @@ def update_block_bounds_(
         ids: int32 [U], rows that changed.
         means: float32 [N, 3].
         scales: float32 [N, 3], logarithms of the standard deviations.
-        pending: bounds how far rows may move when pending steps are applied; None: there are none.
+        pending: `PendingSteps`; None: there are none.
     """
     with below_autograd():
         torch.ops.blitzgs.update_block_bounds_(bounds, ids, _rows(means, scales, pending))

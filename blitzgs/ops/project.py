@@ -84,11 +84,8 @@ def _gradients(
 ) -> Sequence[Tensor | None]:
     """Return the gradients of viewmats and of all gaussians, or of the tables, if they are needed.
 
-    Args:
-        needed: which of means, quats, scales, opacities and the given parts of SH need a gradient.
-        need_viewmats: whether viewmats need a gradient.
-        sparse: which of these gradients are to be sparse.
-        v: gradients of the splats; None: zero.
+    `needed`: which of means, quats, scales, opacities and the given parts of SH need a gradient; `sparse`:
+    which of these are to be sparse. `v`: gradients of the splats; None: zero.
     """
     saved = _Saved.of(ctx)
 

@@ -64,13 +64,10 @@ def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
 def full_gradients(
     ids: Tensor, gradients: Sequence[Tensor | None], shapes: Sequence[torch.Size], sparse: Sequence[bool]
 ) -> list[Tensor | None]:
-    """Return the gradients of whole parameters from those of their rows `ids`, as sparse or dense tensors.
+    """Return the gradients of whole parameters from those of their rows, as sparse or dense tensors.
 
-    Args:
-        ids: int32 or int64 [U], ascending, each once.
-        gradients: [U, ...] of each parameter; None: it needs none.
-        shapes: [N, ...], of each parameter.
-        sparse: which of the results are sparse.
+    `ids`: int32 or int64 [U], ascending, each once. `gradients`: [U, ...] of each parameter; None: it needs
+    none. `shapes`: [N, ...] of each. `sparse`: which of the results are sparse.
     """
     ids = ids.long()
     return [

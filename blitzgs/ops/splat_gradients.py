@@ -79,11 +79,8 @@ class SplatGradients(NamedTuple):
     ) -> SplatGradients:
         """Return the gradients of a rank's own splats, summed over the ranks that composited them.
 
-        Args:
-            values: [sum(group_sizes), F], the rows of each rank's `side_by_side` for this rank's splats.
-            places: from `blitzgs.ops.exchange.scatter_splats`.
-            group_sizes: number of splats that this rank sent to each rank.
-            splats: number P of this rank's own splats.
+        `values`: [sum(group_sizes), F], the rows of each rank's `side_by_side` for this rank's splats. The
+        other arguments are those of `sum_splats`.
         """
         columns = self._columns()
         widths = [math.prod(column.shape[1:]) for column in columns]
