@@ -1,32 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """INRIA's interface renders, in float64, what the formulas of INRIA's code give, gradients included."""
 
-import math
-
 import pytest
 import torch
 
 from blitzgs.compat import inria
-from tests.helpers import DEVICES, refused, relative_error, ssim_map
-
-Y0, Y1 = 0.28209479177387814, 0.4886025119029199
+from blitzgs.reference.projection import sh_colors
+from tests.helpers import DEVICES, orbit_camera, refused, relative_error, ssim_map
 
 
 def camera(angle=0.3, distance=3.0, tanfovx=0.5, tanfovy=0.4, shift=(0.0, 0.0), dtype=torch.float64):
     """Return the matrices of a trainer for row vectors: view, full projection, and the centre."""
-    centre = torch.tensor([math.sin(angle), -0.4, -math.cos(angle)], dtype=torch.float64) * distance
-    forward = -centre / centre.norm()
-    right = torch.linalg.cross(torch.tensor([0.0, 1, 0], dtype=torch.float64), forward)
-    right /= right.norm()
-    world_to_view = torch.eye(4, dtype=torch.float64)
-    world_to_view[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    world_to_view[:3, 3] = -world_to_view[:3, :3] @ centre
+    view = orbit_camera(angle, distance).T
+    centre = -view[:3, :3] @ view[3, :3]
     near, far = 0.01, 100.0
     clip = torch.zeros(4, 4, dtype=torch.float64)
     clip[0, 0], clip[1, 1] = 1 / tanfovx, 1 / tanfovy
     clip[0, 2], clip[1, 2] = shift
     clip[2, 2], clip[2, 3], clip[3, 2] = far / (far - near), -far * near / (far - near), 1
-    view = world_to_view.T
     return view.to(dtype), (view @ clip.T).to(dtype), centre.to(dtype)
 
 
@@ -43,15 +34,6 @@ def covariances(scales, rotations, modifier):
     ).view(-1, 3, 3)  # fmt: skip
     scaled = matrix @ torch.diag_embed(modifier * scales)
     return scaled @ scaled.transpose(1, 2)
-
-
-def colours(sh, degree, directions):
-    """SH of degree 0 or 1, clamped."""
-    value = Y0 * sh[:, 0]
-    if degree > 0:
-        x, y, z = directions[:, :, None].unbind(1)
-        value = value - Y1 * y * sh[:, 1] + Y1 * z * sh[:, 2] - Y1 * x * sh[:, 3]
-    return (value + 0.5).clamp(min=0)
 
 
 def render(s, means, opacities, offsets, sh=None, colors=None, covariance=None, tile_cut=False):
@@ -90,8 +72,7 @@ def render(s, means, opacities, offsets, sh=None, colors=None, covariance=None, 
     if s.antialiasing:
         opacities = opacities * (sharp / determinant).clamp(min=0.000025).sqrt()
     if colors is None:
-        directions = torch.nn.functional.normalize(means - s.campos, dim=1)
-        colors = colours(sh, s.sh_degree, directions)
+        colors = sh_colors(means, sh, s.campos, s.sh_degree)
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     image = means.new_zeros(colors.shape[1], height, width)
     inverse, depth, left = (means.new_zeros(height, width) for _ in range(3))

@@ -188,15 +188,6 @@ def test_errors_name_the_value_of_intersect():
         intersect(*splats.geometry(), n_cameras=1, width=2**20, height=2**20)
 
 
-@pytest.mark.parametrize("known", [False, True])
-def test_opcheck_of_intersect(known):
-    splats = random_splats(20, WIDTH, HEIGHT)
-    n_isects = len(intersect(*splats.geometry(), n_cameras=1, width=WIDTH, height=HEIGHT)[0]) if known else -1
-    torch.library.opcheck(
-        torch.ops.blitzgs.intersect, (*splats.geometry(), None, 1, WIDTH, HEIGHT, 16, 0, -1, n_isects)
-    )
-
-
 VIEW = (1, WIDTH, HEIGHT, 16)
 ops = torch.ops.blitzgs
 
@@ -365,12 +356,13 @@ def test_errors_name_the_value_of_splat_count(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_opcheck_of_splat_count(device):
+def test_opcheck(device):
     columns = Columns(20, 30, device)
-    arguments = (*columns.padded.geometry(), None, *VIEW, 0, -1)
-    torch.library.opcheck(ops.intersect, (*arguments, -1, columns.count))
-    lists = ops.intersect(*columns.alone.geometry(), None, *VIEW, 0, -1, -1)
-    torch.library.opcheck(ops.intersect, (*arguments, len(lists[0]), columns.count))
+    alone, padded = ((*s.geometry(), None, *VIEW, 0, -1) for s in (columns.alone, columns.padded))
+    lists = ops.intersect(*alone, -1)
+    for capacity in (-1, len(lists[0])):
+        torch.library.opcheck(ops.intersect, (*alone, capacity))
+        torch.library.opcheck(ops.intersect, (*padded, capacity, columns.count))
     values = [t.requires_grad_() for t in columns.padded.values()]
     torch.library.opcheck(
         ops.rasterize_fwd,

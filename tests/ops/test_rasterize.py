@@ -12,7 +12,7 @@ from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.ops.splat_gradients import GradientBuffer, gradient_columns, gradient_table_of
 from tests.helpers import on_threads
-from tests.ops.splats import Splats, dense_composite, kept_by, near_a_cut, random_splats
+from tests.ops.splats import Splats, by_definition, kept_by, random_splats
 from tests.ops.test_photometric import images
 
 WIDTH, HEIGHT = 53, 37  # neither is a multiple of a tile
@@ -60,8 +60,6 @@ def test_image_and_gradients_match_the_definition(channels, dtype, image_error, 
     backgrounds = torch.rand(2, channels, generator=generator, dtype=torch.float64).to(dtype)
     v_renders = torch.randn(2, HEIGHT, WIDTH, channels, generator=generator, dtype=torch.float64)
     v_alphas = torch.randn(2, HEIGHT, WIDTH, generator=generator, dtype=torch.float64)
-    clear = ~near_a_cut(splats, WIDTH, HEIGHT)
-    v_renders, v_alphas = v_renders * clear[..., None], v_alphas * clear
     tile_lists = lists(splats, 2)
 
     def ours(values, background):
@@ -71,11 +69,13 @@ def test_image_and_gradients_match_the_definition(channels, dtype, image_error, 
 
     def dense(values, background):
         exact = Splats(*values, splats.depths.double(), splats.camera_ids)
-        return dense_composite(exact, WIDTH, HEIGHT, 2, background)
+        return by_definition(exact, WIDTH, HEIGHT, 2, background)[:2]
 
     exact = splats.to(torch.float64)
     renders, alphas = ours(splats.values(), backgrounds)
-    true_renders, true_alphas = dense(exact.values(), backgrounds.double())
+    true_renders, true_alphas, cut = by_definition(exact, WIDTH, HEIGHT, 2, backgrounds.double())
+    clear = ~cut
+    v_renders, v_alphas = v_renders * clear[..., None], v_alphas * clear
     assert clear.float().mean() > 0.95
     assert ((renders - true_renders).abs() * clear[..., None]).max() < image_error
     assert ((alphas - true_alphas).abs() * clear).max() < image_error
