@@ -245,17 +245,10 @@ def _splats_of_pixels(
     listed = checked_pixels(pixels, image_ids, images, width, height)
     numbers = None if listed is None else listed.numbers
     end = torch.full((1,), len(flatten_ids), dtype=torch.int64, device=tile_offsets.device)
+    geometry = means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.reshape(-1)
+    lists = flatten_ids.int(), torch.cat([tile_offsets.reshape(-1).long(), end])
     found = pixel_splats(
-        means2d.reshape(-1, 2),
-        conics.reshape(-1, 3),
-        opacities.reshape(-1),
-        flatten_ids.int(),
-        torch.cat([tile_offsets.reshape(-1).long(), end]),
-        n_cameras=images,
-        width=width,
-        height=height,
-        tile_size=tile_size,
-        strongest=strongest,
-        pixels=numbers,
-    )
+        *geometry, *lists, n_cameras=images, width=width, height=height, tile_size=tile_size,
+        strongest=strongest, pixels=numbers,
+    )  # fmt: skip
     return found, (*lead, height, width) if numbers is None else (len(numbers),)

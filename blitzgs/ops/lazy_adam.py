@@ -132,7 +132,7 @@ class GrowingSchedule(AdamTables):
 
     def is_full(self) -> bool:
         """Tell whether no further step fits."""
-        return self.last - self.begin >= self.LENGTH
+        return self.row >= self.LENGTH
 
     def step_(
         self,
