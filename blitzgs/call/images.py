@@ -84,8 +84,9 @@ def render(
         lists, composited_lists = lists_of(rendered, images, projection, count, image.pixels)
     renders, alphas = rasterize(
         rendered.means2d, rendered.conics, rendered.opacities, channels,
-        composited_lists.splats, composited_lists.offsets, **composited_lists.grid._asdict(),
-        backgrounds=image.backgrounds, store_absgrad=layout.absgrad_store() if image.absgrad else None,
+        composited_lists.splats, composited_lists.offsets, n_cameras=images, width=projection.width,
+        height=projection.height, tile_size=composited_lists.grid.tile_size, backgrounds=image.backgrounds,
+        store_absgrad=layout.absgrad_store() if image.absgrad else None,
         composited=None if queued is None else queued.composited, meta_geometry=meta_geometry,
     )  # fmt: skip
     if not compiling:

@@ -137,8 +137,8 @@ class Layout:
             order = torch.sort(splats.camera_ids, stable=True)[1]
             self.places = Places((order,), tuple(order.shape))
         columns = (splats.means2d, splats.conics, splats.depths, splats.opacities)
-        names = ("means2d", "conics", "depths", "opacities")
-        self.rendered = dict(zip(names, self.arrange(*columns, under=under), strict=True))
+        means2d, conics, depths, opacities = self.arrange(*columns, under=under)
+        self.rendered = {"means2d": means2d, "conics": conics, "depths": depths, "opacities": opacities}
 
     def arrange(self, *columns: Tensor, under: Tensor | None = None) -> tuple[Tensor, ...]:
         """Arrange columns of splats as `Places.arrange` does."""

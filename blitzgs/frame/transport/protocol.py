@@ -258,24 +258,25 @@ class LocalTransport:
         projected = inputs.project(capacity)
         splats, copy = projected.for_compositing, HostCopy(projected.totals)
         stage_ended("project")
+        known: list[int] = [] if capacity is not None else copy.read().tolist()
         if capacity is None:
-            arrived = Arrived(splats, None, copy.read().tolist()[2])
+            arrived = Arrived(splats, None, known[2])
         else:
             arrived = Arrived(splats, projected.n_splats, capacity.isects)
         stage_ended("exchange")
 
         def finish() -> tuple[Sizes, ExchangeResult | None]:
             on_host = copy.read()
-            totals = on_host.tolist()
-            needed = Sizes(*totals[:VIEW_TOTALS])
-            if capacity is not None and not capacity.holds(needed):
-                return needed, None  # the splats are undefined
-            counts, visible = on_host[:3], projected.totals[VIEW_TOTALS:]
+            totals = known or on_host.tolist()
+            needed, counts = Sizes(*totals[:VIEW_TOTALS]), on_host[:3]
             if capacity is None:
                 own, composited = projected.splats._replace(counts=counts), splats
-            else:
+            elif capacity.holds(needed):
                 valid = projected.first(needed, counts)
                 own, composited = valid.splats, valid.for_compositing
+            else:
+                return needed, None  # the splats are undefined
+            visible = projected.totals[VIEW_TOTALS:]
             return needed, ExchangeResult(own, composited, totals, visible, None, None)
 
         return Exchange(projected, arrived, None, finish)
