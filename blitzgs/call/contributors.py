@@ -12,7 +12,7 @@ from torch import Tensor
 from blitzgs.call.arguments import check_tensors, checked_options, gaussians_of
 from blitzgs.call.bad_values import check_intrinsics, warn_of_non_finite
 from blitzgs.call.extras import checked_pixels
-from blitzgs.ops.importance import UNITS, PixelSplats, pixel_splats, splat_contributions
+from blitzgs.ops.importance import UNITS, PixelSplats, pixel_splats
 from blitzgs.ops.intersect import TileGrid, tile_counts
 from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectionInputs
@@ -96,7 +96,7 @@ def contributions(
         lists = torch.ops.blitzgs.intersect(
             *geometry, splats.depths, splats.camera_ids, None, *grid, int(splats.counts[2]), None, True
         )
-        splat_weights, splat_pixels, _ = splat_contributions(*geometry, *lists, **grid._asdict())
+        splat_weights, splat_pixels, _ = torch.ops.blitzgs.contributions(*geometry, *lists, *grid)
         at = splats.camera_ids.long() + begin, splats.gaussian_ids.long()
         weights[at] = splat_weights.double() / UNITS
         pixels[at] = splat_pixels.long()

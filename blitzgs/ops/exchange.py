@@ -29,7 +29,7 @@ def scatter_splats(
     Returns:
         packed int32 [words]: one group after the other, in each the columns one after the other; and places
         int64 [ceil(P / PLACE_SPLATS), M], where in each group the splats are: what
-        `splat_gradients.sum_splats` needs. The order of the splats of a run is kept; on CUDA that of runs is
+        `SplatGradients.sum_returned` needs. The order of the splats of a run is kept; on CUDA that of runs is
         not.
 
     Raises:

@@ -11,50 +11,10 @@ from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 
-# Units of a weight in 1, kContributionScale of csrc/importance/importance.h.
+# Units of a weight in 1, kContributionScale of csrc/importance/importance.h. The op `contributions` returns
+# sums of such integers, so that they do not depend on the order of addition, and the sums of disjoint ranges
+# of tiles add up to the sum of all tiles.
 UNITS = 1 << 32
-
-
-def splat_contributions(
-    means2d: Tensor,
-    conics: Tensor,
-    splat_opacities: Tensor,
-    isect_splats: Tensor,
-    tile_offsets: Tensor,
-    *,
-    n_cameras: int,
-    width: int,
-    height: int,
-    tile_size: int = 16,
-    tile_begin: int = 0,
-    tile_end: int = -1,
-    n_splats: Tensor | None = None,
-    squares: bool = False,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Sum alpha T over the pixels at which each splat is composited, and count these pixels.
-
-    Alpha and T have the same bits as in `blitzgs.ops.rasterize.rasterize`. The sums are integers, so
-    they do not depend on the order of addition, and the sums of disjoint tile ranges add up to the sum of all
-    tiles.
-
-    Args: those of `blitzgs.ops.rasterize.rasterize` (tiles of 16 px on CUDA), and
-        n_splats: int64 [1] on the device of the splats: only the first `n_splats` splats are valid. None:
-            all.
-        squares: sum (alpha T)^2 too.
-
-    Returns:
-        Weights int64 [P], in units of 2^-32 (each alpha T rounded to the nearest); pixels int32 [P]; and the
-        sums of the squares int64 [P], in the same units (each square rounded down), or [0] if not asked for.
-
-    Raises:
-        RuntimeError: a tile range outside the images, or a tile size that CUDA lacks.
-    """
-    return torch.ops.blitzgs.contributions(
-        means2d, conics, splat_opacities, isect_splats, tile_offsets,
-        n_cameras, width, height, tile_size, tile_begin, tile_end, n_splats, squares,
-    )  # fmt: skip
-
-
 # How many times a weight is divided by the square root of its number of pixels, for each score rule.
 DIVISIONS = {"weight": 0, "root": 1, "density": 2}
 

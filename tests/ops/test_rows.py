@@ -8,7 +8,6 @@ from blitzgs.call.layout import Places
 from blitzgs.ops.exchange import PLACE_SPLATS, gather_splats, scatter_splats
 from blitzgs.ops.projection_types import first_rows
 from blitzgs.ops.rows import KeptMarks, distinct_rows, sparse_rows
-from blitzgs.ops.splat_gradients import sum_splats
 from tests.helpers import BACKENDS, DEVICES, refused
 
 COLUMNS = [((2,), torch.float32), ((3,), torch.float64), ((), torch.int64), ((), torch.float32)]
@@ -159,6 +158,7 @@ def test_foreign_sparse_tensors_are_coalesced():
 
 
 RANKS = 3
+sum_splats = torch.ops.blitzgs.sum_splats
 
 
 def columns(n, dtype=torch.float32):
