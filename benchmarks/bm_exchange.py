@@ -141,7 +141,7 @@ class Workload:
         return {
             "splats": len(frame.projected.gaussian_ids),
             "visible": len(frame.projected.visible_ids),
-            "sent": 0 if frame.traffic is None else _sent_elsewhere(frame.traffic, self.ranks.rank),
+            "sent": 0 if frame.way_back is None else _sent_elsewhere(frame.way_back.traffic, self.ranks.rank),
             "work": sums,
             "ranges": batch.ranges,
         }

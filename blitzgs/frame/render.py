@@ -26,7 +26,6 @@ from blitzgs.frame.transport.protocol import (
     Arrived,
     Exchange,
     ExchangeResult,
-    Traffic,
     Transport,
     WayBack,
     stage_ended,
@@ -101,7 +100,6 @@ class Frame(NamedTuple):
     splats: Splats  # the splats that this rank composited: its own, or those that it received
     assignment: TileAssignment | None  # the tiles of each rank; None: one rank composites all
     way_back: WayBack | None  # returns the gradients of splats to their owners; None: one rank owns all
-    traffic: Traffic | None  # numbers of splats sent between the ranks; None: none were sent
     # int64 [B], Gaussians visible in each view, over all ranks; valid until the next exchange.
     visible: Tensor
     active: ActiveRows | None  # rows that were considered, and the views of each; None: all
@@ -159,7 +157,6 @@ def render_frame(
         splats=splats,
         assignment=assignment,
         way_back=result.way_back,
-        traffic=result.traffic,
         visible=result.visible,
         active=rows,
         renders=renders,

@@ -62,7 +62,7 @@ def _exchange(table, ranks, transport):
     else:
         sums = frame.way_back.return_gradients(SplatGradients(gradients)).parts
     own = assignment.ranges.pixel_mask(ranks.rank, ranks.device)
-    return [*arrived, *sums, frame.renders[own], frame.visible.clone()], frame.traffic.needed
+    return [*arrived, *sums, frame.renders[own], frame.visible.clone()], frame.way_back.traffic.needed
 
 
 def _both_ways(ranks):

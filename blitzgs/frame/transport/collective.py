@@ -73,6 +73,6 @@ class CollectiveTransport:
         # All ranks decide the same, because they have estimated the same number of blocks.
         if capacity is None or needed.blocks <= capacity.blocks:
             way_back = WayBack(ranks, traffic, places)
-            result = ExchangeResult(own, splats, totals[ranks.rank], visible, traffic, way_back)
+            result = ExchangeResult(own, splats, totals[ranks.rank], visible, way_back)
         stage_ended("exchange")
         return Exchange(projected, Arrived(splats, None, traffic.n_isects), None, lambda: (needed, result))

@@ -176,7 +176,6 @@ class PeerTransport:
                 splats=buffers.splats.first(sum(traffic.received)),
                 totals=totals()[ranks.rank],
                 visible=shared.sums[VIEW_TOTALS : VIEW_TOTALS + n_views],
-                traffic=traffic,
                 way_back=way_back,
             )
 

@@ -119,7 +119,6 @@ class ExchangeResult(NamedTuple):
     splats: Splats  # the splats that this rank composites, only valid ones
     totals: list[int]  # this rank's `ProjectionOutputs.totals`
     visible: Tensor  # int64 [B], splats of each view over all ranks; valid until the next exchange
-    traffic: Traffic | None  # numbers of splats sent between the ranks; None: there is one rank
     way_back: WayBack | None  # returns the gradients; None: there is one rank, which has them already
 
 
@@ -277,6 +276,6 @@ class LocalTransport:
             else:
                 return needed, None  # the splats are undefined
             visible = projected.totals[VIEW_TOTALS:]
-            return needed, ExchangeResult(own, composited, totals, visible, None, None)
+            return needed, ExchangeResult(own, composited, totals, visible, None)
 
         return Exchange(projected, arrived, None, finish)
