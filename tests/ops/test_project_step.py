@@ -24,7 +24,7 @@ STEP, WIDTH, HEIGHT, EPS2D = 70, 90, 60, 0.3
 class Scene:
     """Gaussians before some cameras, an optimiser's state, and gradients of the splats."""
 
-    def __init__(self, n, k, views, device, dtype):
+    def __init__(self, n, k, views, device="cpu", dtype=torch.float32, degree=None, antialiased=False):
         generator = torch.Generator().manual_seed(n + k)
         normal = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
         params = [normal(n, 3), normal(n, 4), 0.5 * normal(n, 3) - 3, normal(n), 0.3 * normal(n, k, 3)]
@@ -40,22 +40,24 @@ class Scene:
         K = torch.tensor([[80.0, 0, 45], [0, 80, 30], [0, 0, 1]])
         self.Ks = K.repeat(views, 1, 1).to(device, dtype)
         lazy_adam_catch_up_(self.state, self.schedule(), STEP - 1)
-        self.degree = min(3, math.isqrt(k) - 1)
+        self.degree = min(3, math.isqrt(k) - 1) if degree is None else degree
+        self.antialiased = antialiased
         self.scale_reg = torch.linspace(0.1, 0.2, views).to(device, dtype)
         self.opacity_reg = torch.linspace(0.3, -0.2, views).to(device, dtype)
         self.seed = generator
+        self.render()
 
-    def render(self, antialiased):
+    def render(self):
         self.splats = project(
             *self.state.params, self.viewmats, self.Ks, WIDTH, HEIGHT, sh_degree=self.degree, eps2d=EPS2D,
-            antialiased=antialiased,
+            antialiased=self.antialiased,
         )  # fmt: skip
         shapes = (self.splats.means2d, self.splats.conics, self.splats.opacities, self.splats.colors)
         self.v = SplatGradients(
             [torch.randn(s.shape, generator=self.seed, dtype=torch.float64).to(s) for s in shapes]
         )
         self.options = ProjectionOptions(
-            WIDTH, HEIGHT, sh_degree=self.degree, eps2d=EPS2D, antialiased=antialiased
+            WIDTH, HEIGHT, sh_degree=self.degree, eps2d=EPS2D, antialiased=self.antialiased
         )
 
     def splat_ids(self):
@@ -132,11 +134,7 @@ def compare(a, b, exact):
     ],
 )  # fmt: skip
 def test_equals_backward_and_step(device, n, k, degree, views):
-    antialiased = views == 3
-    scenes = [Scene(n, k, views, device, torch.float32) for _ in range(2)]
-    for scene in scenes:
-        scene.degree = degree
-        scene.render(antialiased)
+    scenes = [Scene(n, k, views, device, degree=degree, antialiased=views == 3) for _ in range(2)]
     before = [p.clone() for p in scenes[0].state.params]
     scenes[0].one_after_the_other()
     scenes[1].at_once()
@@ -158,10 +156,7 @@ def test_equals_backward_and_step(device, n, k, degree, views):
 )
 def test_gradients_are_read_where_they_are(device, width, n, k, degree, views):
     """Gradients in the columns of one table give the same result as separate tensors."""
-    plain, other = (Scene(n, k, views, device, torch.float32) for _ in range(2))
-    for scene in (plain, other):
-        scene.degree = degree
-        scene.render(antialiased=False)
+    plain, other = (Scene(n, k, views, device, degree=degree) for _ in range(2))
     other.pack(width)
     agree(plain, other, device == "cpu")
 
@@ -177,10 +172,7 @@ def test_gradients_are_read_where_they_are(device, width, n, k, degree, views):
 )  # fmt: skip
 def test_gradients_are_read_from_the_tables_of_several_ranks(n, k, degree, views):
     """Gradients in the tables of several ranks give the same result as tensors of their sums."""
-    plain, other = (Scene(n, k, views, "cuda", torch.float32) for _ in range(2))
-    for scene in (plain, other):
-        scene.degree = degree
-        scene.render(antialiased=False)
+    plain, other = (Scene(n, k, views, "cuda", degree=degree) for _ in range(2))
     assert n == 1 or len(plain.splats.camera_ids) > 2 * n * views // 3  # more than a warp holds at many views
     plain.v = other.spread()
     sums = torch.full_like(plain.splats.means2d, torch.nan)
@@ -201,23 +193,20 @@ def agree(plain, other, exact, means2d_sums=None):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_repeats_bit_for_bit(device):
-    scenes = [Scene(5000, 16, 2, device, torch.float32) for _ in range(2)]
+    scenes = [Scene(5000, 16, 2, device) for _ in range(2)]
     for scene in scenes:
-        scene.render(False)
         scene.at_once()
     compare(*scenes, exact=True)
 
 
 def test_float64_and_nothing_visible():
-    scenes = [Scene(200, 16, 1, "cpu", torch.float64) for _ in range(2)]
-    for scene in scenes:
-        scene.render(False)
+    scenes = [Scene(200, 16, 1, dtype=torch.float64) for _ in range(2)]
     scenes[0].one_after_the_other()
     scenes[1].at_once()
     compare(*scenes, exact=True)
     scene = scenes[1]
     scene.viewmats[:, 2, 3] = -100  # all behind the camera
-    scene.render(False)
+    scene.render()
     before = [p.clone() for p in scene.state.params]
     scene.at_once()
     assert len(scene.splats.visible_ids) == 0
@@ -225,11 +214,10 @@ def test_float64_and_nothing_visible():
 
 
 def test_errors_name_the_value():
-    scene = Scene(20, 16, 1, "cpu", torch.float32)
-    scene.render(False)
+    scene = Scene(20, 16, 1)
     scene.v.parts[1] = scene.v.parts[1][:, :2]
     refused(RuntimeError, r"project_bwd_step_: v_conics must have shape \[\d+, 3\]", scene.at_once)
-    scene.render(False)
+    scene.render()
     scene.state.exp_avgs[4] = scene.state.exp_avgs[4][:, :4].contiguous()
     refused(RuntimeError, r"the moments of sh must have its shape \[20, 16, 3\]", scene.at_once)
 
@@ -237,8 +225,7 @@ def test_errors_name_the_value():
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_regularisers_have_the_gradients_of_their_definitions(backend):
     """Regularisers alone, without gradients of splats, agree with autograd in float64."""
-    scene, scale = Scene(800, 16, 3, *backend), 1.0 if backend[1] == torch.float32 else 1e-8
-    scene.render(True)
+    scene, scale = Scene(800, 16, 3, *backend, antialiased=True), 1.0 if backend[1] == torch.float32 else 1e-8
     scene.v = SplatGradients([torch.zeros_like(part) for part in scene.v.parts])
     _, _, v_scales, v_opacities, *_ = scene.backward()
     scales, opacities = (scene.state.params[c].double().requires_grad_() for c in (2, 3))
@@ -256,8 +243,7 @@ def test_regularisers_have_the_gradients_of_their_definitions(backend):
 
 
 def test_errors_name_what_is_wrong_with_weights():
-    scene = Scene(20, 16, 2, "cpu", torch.float32)
-    scene.render(False)
+    scene = Scene(20, 16, 2)
     weights = scene.opacity_reg
     scene.opacity_reg = weights.double()
     refused(RuntimeError, "project_bwd: opacity_reg must be Float, got Double", scene.backward)
@@ -266,14 +252,13 @@ def test_errors_name_what_is_wrong_with_weights():
 
 
 def test_errors_name_what_is_wrong_with_tables():
-    scene = Scene(20, 16, 1, "cpu", torch.float32)
-    scene.render(False)
+    scene = Scene(20, 16, 1)
     scene.spread()
     refused(RuntimeError, "project_bwd_step_: tables of gradients need CUDA", scene.at_once)
-    scene.render(False)
+    scene.render()
     del scene.v.parts[1:3]
     refused(RuntimeError, "v_splats must be v_means2d, .* or one table, got 2 tensors", scene.backward)
-    scene.render(False)
+    scene.render()
     with pytest.raises(RuntimeError, match="means2d_sums needs gradients at ranks"):
         scene.at_once(torch.zeros_like(scene.splats.means2d))
 
@@ -281,8 +266,7 @@ def test_errors_name_what_is_wrong_with_tables():
 @pytest.mark.cuda
 @needs_cuda
 def test_errors_name_what_does_not_fit():
-    scene = Scene(20, 16, 1, "cuda", torch.float32)
-    scene.render(False)
+    scene = Scene(20, 16, 1, "cuda")
     scene.spread()
     whole = scene.v
     for change, text in (
@@ -297,8 +281,7 @@ def test_errors_name_what_does_not_fit():
 
 
 def test_opcheck():
-    scene = Scene(20, 16, 1, "cpu", torch.float32)
-    scene.render(False)
+    scene = Scene(20, 16, 1)
     state, schedule = scene.state, scene.schedule()
     torch.library.opcheck(
         torch.ops.blitzgs.project_bwd_step_,
