@@ -40,15 +40,7 @@ _WHOLE = {
     "tile_size": (1, 64, "1 to 64 px"),
     "sh_degree": (0, MAX_SH_DEGREE, f"0 to {MAX_SH_DEGREE}"),
 }
-_ANY = object()  # in place of a default: no value changes the result
-# The same for `blitzgs.raw_rasterization`, which has fewer of the arguments.
-RAW_DEFAULTS: dict[str, Any] = {
-    **GSPLAT_DEFAULTS, "packed": True, "distributed": False, "camera_model": "pinhole", "covars": None,
-    "return_normals": False, "extra_signals": None, "extra_signals_sh_degree": None, "return_median": False,
-    "pixels": None, "image_ids": None, "channel_chunk": _ANY, "segmented": _ANY, "with_ut": False,
-    "radial_coeffs": None, "tangential_coeffs": None, "thin_prism_coeffs": None, "rolling_shutter": None,
-    "viewmats_rs": None, "ut_params": None,
-}  # fmt: skip
+ANY = object()  # in place of a default: no value changes the result
 
 
 class Signals(NamedTuple):
@@ -128,7 +120,7 @@ def check_further(
         foreign = name == "rolling_shutter" and getattr(value, "name", value) == "GLOBAL"
         foreign |= name == "renderer_config" and type(value).__name__ == "RendererConfig_MixedBatch"
         is_default = value is default or (isinstance(value, str) and value == default)
-        if not (value is None or is_default or default is _ANY or foreign):
+        if not (value is None or is_default or default is ANY or foreign):
             shown = f"a tensor {list(value.shape)}" if isinstance(value, Tensor) else repr(value)
             raise ValueError(f"blitzgs.{function} does not support {name}={shown}; leave it out")
 

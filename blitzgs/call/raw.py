@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Iterable, Mapping
+from functools import cache
 from typing import Any, Protocol
 
 import torch
@@ -12,9 +14,10 @@ from torch import Tensor
 
 from blitzgs._torch import not_compiled
 from blitzgs.call.arguments import (
+    ANY,
     DEFAULT_TILE_SIZE,
+    GSPLAT_DEFAULTS,
     KERNEL_SH_DEGREE,
-    RAW_DEFAULTS,
     RENDER_MODES,
     check_choice,
     check_further,
@@ -25,6 +28,7 @@ from blitzgs.call.arguments import (
 from blitzgs.call.channels import ImageOptions, background_rows
 from blitzgs.call.groups import ShTables, gathered_groups, groups_may_be_queued, groups_of
 from blitzgs.call.images import render
+from blitzgs.call.rasterize import rasterization
 from blitzgs.ops.rows import of_shape
 
 
@@ -114,7 +118,7 @@ def raw_rasterization(
         RuntimeError: float64 tensors are on a GPU, or the call is inside a transform of `torch.func`.
     """
     if further:
-        check_further("raw_rasterization", further, RAW_DEFAULTS)
+        check_further("raw_rasterization", further, _defaults())
     projection = checked_options(
         width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size, rasterize_mode, True
     )
@@ -162,6 +166,14 @@ def raw_rasterization(
     # Several groups, no Gaussians, or another tile size: gather the Gaussians that any group sees.
     groups = gathered_groups(groups, tables)
     return render(gaussians, projection, image, groups=groups)
+
+
+@cache
+def _defaults() -> dict[str, Any]:
+    """Return what only `rasterization` takes, with the defaults; other values are not supported here."""
+    parameters = inspect.signature(rasterization).parameters.values()
+    given = {p.name: p.default for p in parameters if p.default is not p.empty}
+    return {**GSPLAT_DEFAULTS, **given, "channel_chunk": ANY, "segmented": ANY}
 
 
 def _check_leaves(params: Mapping[str, Tensor]) -> None:
