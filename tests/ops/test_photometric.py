@@ -7,6 +7,7 @@ from blitzgs.ops.photometric import (
     photometric_fwd_bwd,
     photometric_loss,
     photometric_sums,
+    pixel_counts,
     ssim,
 )
 from tests.helpers import DEVICES, on_threads, refused, ssim_map, sum_parts
@@ -132,6 +133,20 @@ def test_a_partition_of_the_tiles_adds_up_to_the_whole(device, tile_size):
     torch.testing.assert_close(v_renders, whole[2], rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(l1, whole[0], rtol=1e-6, atol=0)
     torch.testing.assert_close(ssims, whole[1], rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_loss_and_ssim_are_means(device):
+    x, targets, masks = images(device=device)
+    l1, ssims = reference_sums(x, targets.double() / 255, masks)
+    counts = 3 * (masks != 0).sum((1, 2)).double()
+    expected = 0.8 * l1 / counts + 0.2 * (1 - ssims / counts)
+    torch.testing.assert_close(
+        photometric_loss(x, targets, masks.bool()).double(), expected, rtol=1e-6, atol=1e-7
+    )
+    torch.testing.assert_close(ssim(x, targets, masks).double(), ssims / counts, rtol=1e-6, atol=1e-7)
+    assert pixel_counts(x).tolist() == [3 * 53 * 70] * 2
+    assert photometric_loss(x, targets, torch.zeros_like(masks)).tolist() == [0.0, 0.0]
 
 
 @pytest.mark.parametrize("device", DEVICES)
