@@ -6,6 +6,8 @@ The functions about pixels have gsplat's names and results.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -247,8 +249,6 @@ def _splats_of_pixels(
     end = torch.full((1,), len(flatten_ids), dtype=torch.int64, device=tile_offsets.device)
     geometry = means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.reshape(-1)
     lists = flatten_ids.int(), torch.cat([tile_offsets.reshape(-1).long(), end])
-    found = pixel_splats(
-        *geometry, *lists, n_cameras=images, width=width, height=height, tile_size=tile_size,
-        strongest=strongest, pixels=numbers,
-    )  # fmt: skip
+    grid: dict[str, Any] = {"n_cameras": images, "width": width, "height": height, "tile_size": tile_size}
+    found = pixel_splats(*geometry, *lists, **grid, strongest=strongest, pixels=numbers)
     return found, (*lead, height, width) if numbers is None else (len(numbers),)
