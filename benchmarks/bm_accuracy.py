@@ -38,7 +38,8 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.render import Frame, RenderOptions, render_frame
 from blitzgs.frame.tiles import TileAssignment, TileRanges
-from blitzgs.frame.transport import CollectiveTransport, LocalTransport, Transport
+from blitzgs.frame.transport.collective import CollectiveTransport
+from blitzgs.frame.transport.protocol import LocalTransport, Transport
 from blitzgs.ops.intersect import tile_counts
 from blitzgs.ops.projection_types import Views
 from blitzgs.reference import Composite, Splats, composite, project_splats

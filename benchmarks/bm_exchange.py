@@ -44,7 +44,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TILE_COST, TileOwners
 from blitzgs.frame.render import RenderOptions
 from blitzgs.frame.tiles import LOSS_HALO, TileRanges
-from blitzgs.frame.transport import Traffic, stages_told_to
+from blitzgs.frame.transport.protocol import Traffic, stages_told_to
 from blitzgs.ops.projection_types import Views
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import octree_gaussians
@@ -141,7 +141,7 @@ class Workload:
         return {
             "splats": len(frame.projected.gaussian_ids),
             "visible": len(frame.projected.visible_ids),
-            "sent": 0 if frame.traffic is None else _sent_elsewhere(frame.traffic, self.ranks.rank),
+            "sent": 0 if frame.way_back is None else _sent_elsewhere(frame.way_back.traffic, self.ranks.rank),
             "work": sums,
             "ranges": batch.ranges,
         }

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from blitzgs import rasterization
 from blitzgs.frame.render import RenderOptions, backward_splats, inputs_of, render_frame, stage_ended
-from blitzgs.frame.transport import LocalTransport, stages_told_to
+from blitzgs.frame.transport.protocol import LocalTransport, stages_told_to
 from blitzgs.ops.projection_types import Views, WeightedViews
 from blitzgs.table.table import GaussianTable
 

@@ -26,7 +26,7 @@ from blitzgs.config.fields import LossConfig, OptimiserConfig, ScheduleConfig
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.transport import stage_ended, stages_told_to
+from blitzgs.frame.transport.protocol import stage_ended, stages_told_to
 from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.ops.projection_types import Views
 from blitzgs.optim.table_adam import TableAdam

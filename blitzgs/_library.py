@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -13,7 +11,7 @@ from blitzgs import _fakes
 from blitzgs._built import LIBRARY_DIR, REGISTRATION, schema_digest, source_digest
 from blitzgs._torch import below_autograd
 
-__all__ = ["below_autograd", "load_libraries", "schema_digest", "source_digest", "without_autograd"]
+__all__ = ["below_autograd", "load_libraries", "schema_digest", "source_digest"]
 
 
 def load_libraries() -> None:
@@ -38,20 +36,6 @@ def _load(path: Path) -> None:
         raise ImportError(
             f"{path} was built before the ops changed (it does not match {REGISTRATION}): run `make build`"
         )
-
-
-def without_autograd(op: Callable[..., Any]) -> Callable[..., Any]:
-    """Return an op without its autograd formula, for callers that have their own or need no gradient.
-
-    A gradient formula registered in Python takes every call through Python once more: 20 us of the host's
-    time.
-    """
-
-    def call(*arguments: Any) -> Any:
-        with below_autograd():
-            return op(*arguments)
-
-    return call
 
 
 load_libraries()

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -63,6 +63,18 @@ class Scene:
     def leaves(self) -> Scene:
         """Return a copy whose PARAMETERS require gradients."""
         return replace(self, **{k: getattr(self, k).detach().clone().requires_grad_() for k in PARAMETERS})
+
+    def parameters(self) -> list[Tensor]:
+        """Return PARAMETERS."""
+        return [getattr(self, name) for name in PARAMETERS]
+
+    def gradients(self) -> list[Tensor | None]:
+        """Return the gradients of PARAMETERS."""
+        return [tensor.grad for tensor in self.parameters()]
+
+    def view(self, number: int) -> Scene:
+        """Return the scene with one of its cameras."""
+        return replace(self, viewmats=self.viewmats[number, None], Ks=self.Ks[number, None])
 
     def arguments(self) -> tuple:
         """Return the positional arguments of `blitzgs.rasterization`."""
@@ -181,6 +193,18 @@ def ssim_map(x: Tensor, y: Tensor, padding: int = 5) -> Tensor:
     return (top / ((mx * mx + my * my + 0.01**2) * (vx + vy + 0.03**2))).permute(0, 2, 3, 1)
 
 
+def on_threads(call: Callable[[], Any], counts: Iterable[int] = (1, 2, 3)) -> list[Any]:
+    """Return what a call returns with each of these numbers of torch's threads."""
+    before, results = torch.get_num_threads(), []
+    try:
+        for count in counts:
+            torch.set_num_threads(count)
+            results.append(call())
+    finally:
+        torch.set_num_threads(before)
+    return results
+
+
 def refused(error: type[Exception], text: str, call: Callable, /, *given: Any, **named: Any) -> None:
     """Check that a call raises an error of this kind, whose message the regular expression matches."""
     with pytest.raises(error, match=text):
@@ -200,6 +224,13 @@ def relative_error(actual: Tensor, expected: Tensor) -> float:
     if size == 0.0:
         return 0.0 if difference == 0.0 else math.inf
     return difference / size
+
+
+def agree(actual: Iterable[Tensor | None], expected: Iterable[Tensor | None], bound: float) -> None:
+    """Check that tensors have relative errors below a bound, one by one, or are None alike."""
+    for number, (own, wanted) in enumerate(zip(actual, expected, strict=True)):
+        assert (own is None) == (wanted is None), number
+        assert own is None or relative_error(own, wanted) < bound, number
 
 
 def image_error(actual: Tensor, expected: Tensor, cut: Tensor, most_cut: float = 0.1) -> float:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks the arguments of `blitzgs.rasterization` and folds their batch dimensions."""
+"""Checks the arguments of the calls and folds their batch dimensions."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from functools import cache
 from numbers import Integral, Real
 from typing import Any, NamedTuple, NoReturn
 
@@ -16,7 +16,9 @@ from blitzgs._torch import func_transforms_are_active
 from blitzgs.call.covariances import Decomposed
 from blitzgs.capture.cameras import MAX_SIDE
 from blitzgs.ops.harmonics import MAX_SH_DEGREE, colors_of_views
+from blitzgs.ops.projection_types import ProjectionOptions
 from blitzgs.ops.unscented import Lenses
+from blitzgs.util.errors import warn
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
@@ -38,15 +40,7 @@ _WHOLE = {
     "tile_size": (1, 64, "1 to 64 px"),
     "sh_degree": (0, MAX_SH_DEGREE, f"0 to {MAX_SH_DEGREE}"),
 }
-_ANY = object()  # in place of a default: no value changes the result
-# The same for `blitzgs.raw_rasterization`, which has fewer of the arguments.
-RAW_DEFAULTS: dict[str, Any] = {
-    **GSPLAT_DEFAULTS, "packed": True, "distributed": False, "camera_model": "pinhole", "covars": None,
-    "return_normals": False, "extra_signals": None, "extra_signals_sh_degree": None, "return_median": False,
-    "pixels": None, "image_ids": None, "channel_chunk": _ANY, "segmented": _ANY, "with_ut": False,
-    "radial_coeffs": None, "tangential_coeffs": None, "thin_prism_coeffs": None, "rolling_shutter": None,
-    "viewmats_rs": None, "ut_params": None,
-}  # fmt: skip
+ANY = object()  # in place of a default: no value changes the result
 
 
 class Signals(NamedTuple):
@@ -72,17 +66,15 @@ class Scene(NamedTuple):
     colors: Tensor | None  # SH [N, K, 3] or [C, N, K, 3], values [N, D] or [C, N, D]; None: depth alone
     viewmats: Tensor  # [C, 4, 4]
     Ks: Tensor  # [C, 3, 3]
-    # Values [N, E] or [C, N, E], or SH [N, K, E], see `Signals`; None: none.
-    extra_signals: Tensor | None = None
     # Covariances given instead of quats and scales; quats and scales then are their decomposition.
     covariances: Decomposed | None = None
     lenses: Lenses | None = None  # lenses and shutters of the views; None: pinhole cameras
 
 
-@dataclass(frozen=True)
-class Gaussians:
+class Gaussians(NamedTuple):
     """The checked arguments of a call: S scenes of N Gaussians and C views each, I = S C images."""
 
+    function: str  # name of the public function, for warnings
     # The scenes, S >= 1. Without batch dimensions it has the caller's own tensors, so that a leaf stays a
     # leaf.
     scenes: tuple[Scene, ...]
@@ -107,7 +99,7 @@ class Gaussians:
         return math.prod(self.lead)
 
     @property
-    def count(self) -> int:
+    def n_gaussians(self) -> int:
         """Number of Gaussians N of each scene."""
         return self.opacities.shape[-1]
 
@@ -128,12 +120,12 @@ def check_further(
         foreign = name == "rolling_shutter" and getattr(value, "name", value) == "GLOBAL"
         foreign |= name == "renderer_config" and type(value).__name__ == "RendererConfig_MixedBatch"
         is_default = value is default or (isinstance(value, str) and value == default)
-        if not (value is None or is_default or default is _ANY or foreign):
+        if not (value is None or is_default or default is ANY or foreign):
             shown = f"a tensor {list(value.shape)}" if isinstance(value, Tensor) else repr(value)
             raise ValueError(f"blitzgs.{function} does not support {name}={shown}; leave it out")
 
 
-def check_options(
+def checked_options(
     width: int,
     height: int,
     near_plane: float,
@@ -141,19 +133,19 @@ def check_options(
     radius_clip: float,
     eps2d: float,
     sh_degree: int | None,
-    tile_size: int,
-    render_mode: str,
+    tile_size: int | None,
     rasterize_mode: str,
-    camera_model: str,
-) -> None:
-    """Check the arguments that are not tensors.
+    raw: bool = False,
+) -> ProjectionOptions:
+    """Check the arguments that are not tensors and return the projection's options.
 
-    TypeError: a size or the degree is not a whole number, or another option not a number. ValueError: one is
-    out of range or has an unknown value.
+    `sh_degree`: None: 0. `tile_size`: None: 16. `raw`: whether scales and opacities are before their
+    activation. TypeError: a size or the degree is not a whole number, or another option not a number.
+    ValueError: one is out of range or has an unknown value.
     """
-    whole = {"width": width, "height": height, "tile_size": tile_size}
-    if sh_degree is not None:
-        whole["sh_degree"] = sh_degree
+    tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
+    degree = 0 if sh_degree is None else sh_degree
+    whole = {"width": width, "height": height, "tile_size": tile_size, "sh_degree": degree}
     for name, value in whole.items():
         # int comes first, because asking an abstract class takes longer; torch traces with SymInt.
         if not isinstance(value, (int, Integral, torch.SymInt)):
@@ -173,12 +165,17 @@ def check_options(
         raise ValueError(f"eps2d must be a finite number of px^2 of at least 0, got {eps2d}")
     if not radius_clip >= 0:
         raise ValueError(f"radius_clip must be at least 0 px, got {radius_clip}")
-    if render_mode not in RENDER_MODES:
-        raise ValueError(f"render_mode must be one of {', '.join(RENDER_MODES)}, got {render_mode!r}")
-    if rasterize_mode not in RASTERIZE_MODES:
-        raise ValueError(f"rasterize_mode must be 'classic' or 'antialiased', got {rasterize_mode!r}")
-    if camera_model not in CAMERA_MODELS:
-        raise ValueError(f"camera_model must be 'pinhole' or 'fisheye', got {camera_model!r}")
+    check_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
+    antialiased = rasterize_mode == "antialiased"
+    return ProjectionOptions(
+        width, height, tile_size, degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw
+    )
+
+
+def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
+    """Check that an argument is one of some words (ValueError: it is not)."""
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
 
 
 def refuse_func_transforms() -> None:
@@ -216,6 +213,7 @@ def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]
 
 
 def gaussians_of(
+    function: str,
     means: Tensor,
     quats: Tensor,
     scales: Tensor,
@@ -229,19 +227,12 @@ def gaussians_of(
 ) -> Gaussians:
     """Check shapes and fold the batch dimensions into one (ValueError: a shape that does not fit, by name).
 
-    Args:
-        means: [..., N, 3].
-        quats: [..., N, 4].
-        scales: [..., N, 3].
-        opacities: [..., N].
-        colors: with `sh_degree` [..., N, K, D], per view [..., C, N, K, D], or [N, K, D] for all scenes;
-            otherwise [..., N, D] or per view [..., C, N, D].
-        viewmats: [..., C, 4, 4].
-        Ks: [..., C, 3, 3].
-        sh_degree: degree to evaluate; None when `colors` holds values.
-        render_mode: as for `blitzgs.rasterization`; without "RGB", colours are not rendered.
-        raw: whether scales and opacities are before their activation.
+    The arguments are those of `blitzgs.rasterization`, but for the name of the public `function`; and `raw`,
+    whether scales and opacities are before their activation. Without "RGB" in `render_mode`, colours are not
+    rendered.
     """
+    if Ks.requires_grad and torch.is_grad_enabled() and not torch.compiler.is_compiling():
+        warn_of_gradient(function)
     if means.dim() < 2 or viewmats.dim() < 3:
         raise ValueError(
             f"means must be [..., N, 3] and viewmats [..., C, 4, 4], got {list(means.shape)} and "
@@ -280,7 +271,16 @@ def gaussians_of(
     scenes = _scenes(whole, batch) if batch else (whole,)
     columns = zip(Scene._fields, zip(*scenes, strict=True), strict=True)
     named = {name: own for name, own in columns if own[0] is not None}
-    return Gaussians(scenes, colors, opacities, degree, per_view, (*batch, C), raw, named)
+    return Gaussians(function, scenes, colors, opacities, degree, per_view, (*batch, C), raw, named)
+
+
+@cache
+def warn_of_gradient(function: str) -> None:
+    """Warn, once, that intrinsics which require a gradient get none."""
+    warn(
+        f"blitzgs.{function}: Ks requires a gradient and gets none, as in gsplat; pass Ks.detach()",
+        RuntimeWarning,
+    )
 
 
 def _scenes(whole: Scene, batch: tuple[int, ...]) -> tuple[Scene, ...]:

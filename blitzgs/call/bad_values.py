@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What calls say about values that have no effect on an image.
 
-Gaussians and views that are NaN or infinite are not rendered; intrinsics with a skew are refused, and get no
-gradient.
+Gaussians and views that are NaN or infinite are not rendered; intrinsics with a skew are refused.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cache, lru_cache
+from functools import lru_cache
 from itertools import count
 
 import numpy as np
@@ -26,24 +25,7 @@ from blitzgs.util.errors import warn
 _LEAST_SKEW = 1e-6
 
 
-def warn_of_gradient(function: str) -> None:
-    """Warn, once, that intrinsics which require a gradient get none, as in gsplat.
-
-    `function`: name of the public function.
-    """
-    if not torch.compiler.is_compiling() and torch.is_grad_enabled():
-        _warn_of_gradient(function)
-
-
-@cache
-def _warn_of_gradient(function: str) -> None:
-    warn(
-        f"blitzgs.{function}: Ks requires a gradient and gets none, as in gsplat; pass Ks.detach()",
-        RuntimeWarning,
-    )
-
-
-def check_intrinsics(Ks: Sequence[Tensor]) -> None:  # noqa: N803
+def check_intrinsics(Ks: Sequence[Tensor]) -> None:
     """Refuse intrinsics that the pinhole projection does not have; waits for the device.
 
     The projection renders nothing with them, so that calls look only where a view shows nothing.
@@ -155,7 +137,7 @@ def _rows_not_finite(values: Tensor) -> Tensor:
 
 
 def watch_for_non_finite(
-    gaussians: Gaussians, layout: Layout, function: str, nan_marks: Sequence[Tensor], suspects_cameras: bool
+    gaussians: Gaussians, layout: Layout, nan_marks: Sequence[Tensor], suspects_cameras: bool
 ) -> None:
     """Warn about arguments of a renderer with values that are not finite, after a cheap check for any.
 
@@ -181,21 +163,21 @@ def watch_for_non_finite(
         if not torch.ops.blitzgs.find_non_finite(columns, opacities).item():
             return
     if names := ", ".join(non_finite(gaussians)):
-        _warn(function, names, "are not rendered. meta['non_finite'] has their indices.")
+        _warn(gaussians, names, "are not rendered. meta['non_finite'] has their indices.")
 
 
-def warn_of_non_finite(gaussians: Gaussians, function: str) -> None:
+def warn_of_non_finite(gaussians: Gaussians) -> None:
     """Check all arguments, warn of values that are not finite, and name the first Gaussians or views."""
     found = {name: indices[:5].tolist() for name, indices in non_finite(gaussians).items()}
     if found:
         shown = "; ".join(f"{name}, first at {', '.join(map(str, at))}" for name, at in found.items())
-        _warn(function, shown, "contribute nothing")
+        _warn(gaussians, shown, "contribute nothing")
 
 
-def _warn(function: str, where: str, ending: str) -> None:
+def _warn(gaussians: Gaussians, where: str, ending: str) -> None:
     warn(
-        f"blitzgs.{function}: NaN or infinite values in {where}; the Gaussians or views that have them "
-        f"{ending}",
+        f"blitzgs.{gaussians.function}: NaN or infinite values in {where}; the Gaussians or views that have "
+        f"them {ending}",
         RuntimeWarning,
     )
 

@@ -96,9 +96,6 @@ def _signals(splats: ProjectedSplats, gaussians: Gaussians, with_spare: bool) ->
 
     SH are evaluated as colours are, along the direction from the camera centre, but not clamped:
     sum of Y_k(direction) c_k, plus 0.5. Differentiable in the signals and, for SH, in means and viewmats.
-
-    `gaussians`: with signals. `with_spare`: whether the last splats may be spare capacity, whose ids are
-    undefined.
     """
     signals = gaussians.signals
     assert signals is not None
@@ -117,8 +114,6 @@ def _normals(splats: ProjectedSplats, gaussians: Gaussians, sparse_grad: bool, w
 
     The normal is gsplat's: the third axis of the Gaussian, turned so that it faces the camera centre.
     Differentiable in quats.
-
-    `with_spare`: whether the last splats may be spare capacity, whose ids are undefined.
     """
     rows = _rows(splats, gaussians, False, with_spare)
     quats = embedding(rows, _joined([scene.quats for scene in gaussians.scenes]), sparse=sparse_grad)
@@ -141,9 +136,9 @@ def _rows(splats: ProjectedSplats, gaussians: Gaussians, per_view: bool, with_sp
     rows = splats.gaussian_ids
     if len(gaussians.scenes) > 1 or per_view:
         images = splats.camera_ids.long()
-        rows = (images if per_view else images // gaussians.views) * gaussians.count + rows
+        rows = (images if per_view else images // gaussians.views) * gaussians.n_gaussians + rows
     if with_spare:
-        length = len(gaussians.scenes) * gaussians.count * (gaussians.views if per_view else 1)
+        length = len(gaussians.scenes) * gaussians.n_gaussians * (gaussians.views if per_view else 1)
         rows = rows.clamp(0, length - 1)
     return rows
 

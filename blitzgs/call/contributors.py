@@ -6,17 +6,18 @@ The functions about pixels have gsplat's names and results.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
-from blitzgs.call.arguments import check_options, check_tensors, gaussians_of
-from blitzgs.call.bad_values import check_intrinsics, warn_of_gradient, warn_of_non_finite
+from blitzgs.call.arguments import check_tensors, checked_options, gaussians_of
+from blitzgs.call.bad_values import check_intrinsics, warn_of_non_finite
 from blitzgs.call.extras import checked_pixels
-from blitzgs.call.layout import CUDA_TILE_SIZE
-from blitzgs.ops.importance import UNITS, PixelSplats, pixel_splats, splat_contributions
+from blitzgs.ops.importance import UNITS, PixelSplats, pixel_splats
 from blitzgs.ops.intersect import TileGrid, tile_counts
 from blitzgs.ops.project import project_splats
-from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions
+from blitzgs.ops.projection_types import ProjectionInputs
 
 # Views that are projected at once.
 _VIEWS = 8
@@ -77,48 +78,32 @@ def contributions(
             message names it.
         RuntimeError: float64 tensors are on a GPU, or the call is inside a transform of `torch.func`.
     """
-    check_options(
-        width, height, near_plane, far_plane, 0.0, eps2d, None, CUDA_TILE_SIZE, "D", rasterize_mode, "pinhole"
-    )
+    options = checked_options(width, height, near_plane, far_plane, 0.0, eps2d, None, None, rasterize_mode)
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks}, {})
-    if Ks.requires_grad:
-        warn_of_gradient("contributions")
     if means.dim() != 2:
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
-    gaussians = gaussians_of(means, quats, scales, opacities, None, viewmats, Ks, None, "D")
-    warn_of_non_finite(gaussians, "contributions")
+    gaussians = gaussians_of("contributions", means, quats, scales, opacities, None, viewmats, Ks, None, "D")
+    warn_of_non_finite(gaussians)
     check_intrinsics([Ks])
     shape = (len(viewmats), len(means))
     weights = torch.zeros(shape, dtype=torch.float64, device=means.device)
     pixels = torch.zeros(shape, dtype=torch.int64, device=means.device)
     visible = torch.zeros(shape, dtype=torch.bool, device=means.device)
     for begin in range(0, len(viewmats), _VIEWS):
-        views = slice(begin, begin + _VIEWS)
-        n_views = len(viewmats[views])
-        options = ProjectionOptions(
-            width, height, CUDA_TILE_SIZE, near_plane=near_plane, far_plane=far_plane, eps2d=eps2d,
-            antialiased=rasterize_mode == "antialiased", raw=False,
-        )  # fmt: skip
-        cameras = viewmats[views], Ks[views]
+        cameras = viewmats[begin : begin + _VIEWS], Ks[begin : begin + _VIEWS]
         splats = project_splats(ProjectionInputs((means, quats, scales, opacities), cameras, options))
-        splat_weights, splat_pixels = _contributions_of_splats(splats, n_views, width, height)
+        geometry = splats.means2d, splats.conics, splats.opacities
+        grid = TileGrid(len(cameras[0]), width, height, options.tile_size)
+        lists = torch.ops.blitzgs.intersect(
+            *geometry, splats.depths, splats.camera_ids, None, *grid, int(splats.counts[2]), None, True
+        )
+        splat_weights, splat_pixels, _ = torch.ops.blitzgs.contributions(*geometry, *lists, *grid)
         at = splats.camera_ids.long() + begin, splats.gaussian_ids.long()
         weights[at] = splat_weights.double() / UNITS
         pixels[at] = splat_pixels.long()
         visible[at] = True
     return weights, pixels, visible
-
-
-def _contributions_of_splats(
-    splats: ProjectedSplats, n_views: int, width: int, height: int
-) -> tuple[Tensor, Tensor]:
-    geometry = splats.means2d, splats.conics, splats.opacities
-    grid = TileGrid(n_views, width, height, CUDA_TILE_SIZE)
-    lists = torch.ops.blitzgs.intersect(
-        *geometry, splats.depths, splats.camera_ids, None, *grid, int(splats.counts[2]), None, True
-    )
-    return splat_contributions(*geometry, *lists, n_cameras=n_views, width=width, height=height)[:2]
 
 
 def rasterize_num_contributing_gaussians(
@@ -262,17 +247,8 @@ def _splats_of_pixels(
     listed = checked_pixels(pixels, image_ids, images, width, height)
     numbers = None if listed is None else listed.numbers
     end = torch.full((1,), len(flatten_ids), dtype=torch.int64, device=tile_offsets.device)
-    found = pixel_splats(
-        means2d.reshape(-1, 2),
-        conics.reshape(-1, 3),
-        opacities.reshape(-1),
-        flatten_ids.int(),
-        torch.cat([tile_offsets.reshape(-1).long(), end]),
-        n_cameras=images,
-        width=width,
-        height=height,
-        tile_size=tile_size,
-        strongest=strongest,
-        pixels=numbers,
-    )
+    geometry = means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.reshape(-1)
+    lists = flatten_ids.int(), torch.cat([tile_offsets.reshape(-1).long(), end])
+    grid: dict[str, Any] = {"n_cameras": images, "width": width, "height": height, "tile_size": tile_size}
+    found = pixel_splats(*geometry, *lists, **grid, strongest=strongest, pixels=numbers)
     return found, (*lead, height, width) if numbers is None else (len(numbers),)

@@ -8,7 +8,7 @@ splat on the screen, on which the image depends, is then computed from the covar
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,8 +17,7 @@ from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs
 from blitzgs.util.rotations import quaternions
 
 
-@dataclass(frozen=True)
-class Decomposed:
+class Decomposed(NamedTuple):
     """Covariances and their rotations and scales."""
 
     upper: Tensor  # [N, 6]: xx, xy, xz, yy, yz, zz; they get gradients

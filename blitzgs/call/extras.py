@@ -5,13 +5,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from blitzgs.call.arguments import MAX_CHANNELS, Gaussians, Signals, refuse_shape
+from blitzgs.call.arguments import MAX_CHANNELS, Gaussians, Signals, check_choice, refuse_shape
 from blitzgs.call.covariances import decompose
 from blitzgs.ops.unscented import GLOBAL_SHUTTER, Lenses, largest_angles
 
@@ -32,7 +31,7 @@ def with_signals(gaussians: Gaussians, values: Tensor, sh_degree: int | None) ->
     `values`: `extra_signals` of `blitzgs.rasterization`. `sh_degree`: its `extra_signals_sh_degree`.
     ValueError: a shape, the degree or the number of channels does not fit.
     """
-    batch, views, count = gaussians.lead[:-1], gaussians.views, gaussians.count
+    batch, views, count = gaussians.lead[:-1], gaussians.views, gaussians.n_gaussians
     shape, per_view = tuple(values.shape), False
     most = MAX_CHANNELS - NORMAL_CHANNELS - 1
     most -= 0 if gaussians.colors is None else gaussians.colors.shape[-1]
@@ -56,9 +55,8 @@ def with_signals(gaussians: Gaussians, values: Tensor, sh_degree: int | None) ->
         )
     scenes_of = (len(gaussians.scenes), *values.shape[len(batch) :])
     own = values.reshape(scenes_of).unbind(0) if batch else (values,)
-    scenes = tuple(s._replace(extra_signals=part) for s, part in zip(gaussians.scenes, own, strict=True))
     named = {**gaussians.named, "extra_signals": own}
-    return replace(gaussians, scenes=scenes, named=named, signals=Signals(values, sh_degree, per_view))
+    return gaussians._replace(named=named, signals=Signals(values, sh_degree, per_view))
 
 
 def with_covariances(
@@ -73,7 +71,7 @@ def with_covariances(
         raise ValueError("sparse_grad does not support covars; leave one of them out")
     if return_normals:
         raise ValueError("return_normals does not support covars, whose axes have no order; leave one out")
-    wanted = (*gaussians.lead[:-1], gaussians.count, 3, 3)
+    wanted = (*gaussians.lead[:-1], gaussians.n_gaussians, 3, 3)
     if covars.shape != wanted:
         refuse_shape("covars", covars, wanted, "N, 3, 3")
     found = [decompose(own) for own in covars.reshape(len(gaussians.scenes), *wanted[-3:]).unbind(0)]
@@ -83,7 +81,7 @@ def with_covariances(
     )
     named = {name: given for name, given in gaussians.named.items() if name not in ("quats", "scales")}
     named["covars"] = tuple(own.upper for own in found)
-    return replace(gaussians, scenes=scenes, named=named)
+    return gaussians._replace(scenes=scenes, named=named)
 
 
 def check_without_ut(camera_model: str, rolling_shutter: Any, others: Mapping[str, object]) -> None:
@@ -98,24 +96,12 @@ def check_without_ut(camera_model: str, rolling_shutter: Any, others: Mapping[st
         raise ValueError(f"{given[0]} needs with_ut=True; give both, or leave it out")
 
 
-def check_with_ut(viewmats: Tensor, refused: Mapping[str, bool]) -> None:
-    """Check that a call with with_ut has nothing that the unscented projection does not support.
-
-    `refused`: whether arguments that it does not support are given, by what to call them. ValueError: it has
-    one, by name.
-    """
-    compiled = {"torch.compile": torch.compiler.is_compiling()}
-    learned = {"a gradient of viewmats": torch.is_grad_enabled() and viewmats.requires_grad}
-    for name, given in {**refused, **compiled, **learned}.items():
-        if given:
-            raise ValueError(f"with_ut does not support {name}; leave one of them out")
-
-
 def with_lenses(
     gaussians: Gaussians,
     camera_model: str,
     rolling_shutter: Any,
     ut_params: Any,
+    refused: Mapping[str, bool],
     radial_coeffs: Tensor | None,
     tangential_coeffs: Tensor | None,
     thin_prism_coeffs: Tensor | None,
@@ -123,10 +109,16 @@ def with_lenses(
 ) -> Gaussians:
     """Return Gaussians whose scenes have lenses; the arguments are those of `blitzgs.rasterization`.
 
-    ValueError: a shape or value is wrong, or two arguments do not go together.
+    `refused`: whether arguments that the unscented projection does not support are given, by what to call
+    them. ValueError: one is, a shape or value is wrong, or two arguments do not go together.
     """
-    fisheye = camera_model == "fisheye"
     lead, first = gaussians.lead, gaussians.scenes[0].viewmats
+    compiled = {"torch.compile": torch.compiler.is_compiling()}
+    learned = {"a gradient of viewmats": torch.is_grad_enabled() and first.requires_grad}
+    for name, is_given in {**refused, **compiled, **learned}.items():
+        if is_given:
+            raise ValueError(f"with_ut does not support {name}; leave one of them out")
+    fisheye = camera_model == "fisheye"
     given: dict[str, Tensor] = {}
     for name, tensor, last in (
         ("radial_coeffs", radial_coeffs, (4,) if fisheye else (6,)),
@@ -160,14 +152,13 @@ def with_lenses(
         for s, scene in enumerate(gaussians.scenes)
     )
     named = {name: tuple(tensor.split(views)) for name, tensor in given.items()}
-    return replace(gaussians, scenes=scenes, named={**gaussians.named, **named})
+    return gaussians._replace(scenes=scenes, named={**gaussians.named, **named})
 
 
 def _shutter(value: Any) -> int:
     """Return the number of a RollingShutterType, given as gsplat's or by name; None: GLOBAL."""
     name = "GLOBAL" if value is None else getattr(value, "name", value)
-    if name not in _SHUTTERS:
-        raise ValueError(f"rolling_shutter must be one of {', '.join(_SHUTTERS)}, got {value!r}")
+    check_choice("rolling_shutter", name, _SHUTTERS)
     return _SHUTTERS.index(name)
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 
-from blitzgs.call.arguments import refuse_func_transforms
+from blitzgs.call.arguments import check_choice, refuse_func_transforms
 from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.photometric import photometric_fwd_bwd, photometric_loss, pixel_counts, ssim
@@ -218,8 +218,7 @@ def l1_ssim(
         raise ValueError(f"ssim_weight must be in [0, 1], got {ssim_weight}")
     if targets.requires_grad and torch.is_grad_enabled():
         raise ValueError("targets require a gradient, which l1_ssim does not compute; pass targets.detach()")
-    if padding not in PADDINGS:
-        raise ValueError(f"padding must be 'same' or 'valid', got {padding!r}")
+    check_choice("padding", padding, PADDINGS)
     if padding == "valid" and min(renders.shape[-3:-1]) <= 2 * _REACH:
         raise ValueError(
             f"padding='valid' needs images of at least 11 x 11 px, got {list(renders.shape)}; use 'same'"

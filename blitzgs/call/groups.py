@@ -20,8 +20,9 @@ from blitzgs.call.channels import ImageOptions, channels_of
 from blitzgs.call.covariances import Decomposed, shaped_by
 from blitzgs.call.layout import CUDA_TILE_SIZE, Lists
 from blitzgs.frame.render import run_attempts
-from blitzgs.frame.transport.protocol import LocalExchange, LocalTransport
-from blitzgs.ops.project import TableRows, differentiable_splats, project_splats
+from blitzgs.frame.transport.protocol import Exchange, LocalTransport
+from blitzgs.ops.intersect import TileGrid
+from blitzgs.ops.project import TableRows, differentiable_splats, gaussian_tensors, project_splats
 from blitzgs.ops.projection_types import (
     MAX_VIEWS,
     VIEW_TOTALS,
@@ -66,9 +67,7 @@ def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
             views = list(zip(scene.viewmats.split(most), scene.Ks.split(most), strict=True))
         sh = _sh_of_views(gaussians, scene, len(views))
         for part, (viewmats, Ks) in enumerate(views):
-            means, quats, scales, opacities, *_ = scene
-            harmonics = sh[part]
-            own = [means, quats, scales, opacities, *([] if harmonics is None else [harmonics])]
+            own = gaussian_tensors(scene.means, scene.quats, scene.scales, scene.opacities, sh[part])
             inputs = ProjectionInputs(own, (viewmats, Ks), options)
             lenses = scene.lenses and scene.lenses.rows(part * most, (part + 1) * most)
             groups.append(Group(inputs, s * n_views + part * most, scene.covariances, lenses=lenses))
@@ -106,7 +105,7 @@ def project_groups(groups: Sequence[Group], sparse_grad: bool) -> ProjectedSplat
     """Return the splats of all images, those of a group after those of the groups before.
 
     `sparse_grad`: see `blitzgs.ops.project.project`. Returns splats whose camera_ids number all images of the
-    call. Of several groups, visible_ids and splat_offsets are those of the first.
+    call. Of several groups, visible_ids and splat_offsets have no meaning.
     """
     parts = []
     for group in groups:
@@ -118,25 +117,11 @@ def project_groups(groups: Sequence[Group], sparse_grad: bool) -> ProjectedSplat
             splats = differentiable_splats(tables, sparse_grad, *done)
         if group.covariances is not None:
             splats = shaped_by(splats, group.inputs, group.covariances)
-        parts.append(splats)
-    if len(parts) == 1:
-        return parts[0]
-    images = [splats.camera_ids + group.first_image for splats, group in zip(parts, groups, strict=True)]
-    joined = parts[0]._asdict()
-    for name in (
-        "gaussian_ids",
-        "means2d",
-        "conics",
-        "depths",
-        "opacities",
-        "colors",
-        "radii",
-        "tiles_touched",
-    ):
-        joined[name] = torch.cat([getattr(splats, name) for splats in parts])
-    joined["camera_ids"] = torch.cat(images)
-    joined["counts"] = torch.stack([splats.counts for splats in parts]).sum(dim=0)
-    return ProjectedSplats(**joined)
+        if len(groups) == 1:
+            return splats
+        parts.append(splats._replace(camera_ids=splats.camera_ids + group.first_image))
+    *columns, counts = zip(*parts, strict=True)
+    return ProjectedSplats._make((*map(torch.cat, columns), torch.stack(counts).sum(dim=0)))
 
 
 def _splats_of_rows(group: Group) -> tuple[ProjectedSplats, TableRows]:
@@ -204,7 +189,7 @@ def render_queued(
     needed = [t for t in read if t is not None and t.requires_grad] if torch.is_grad_enabled() else []
     backward_follows = len(needed) > 0 and not image.absgrad
 
-    def attempt(capacity: Sizes | None) -> tuple[LocalExchange, tuple[LocalExchange, list[Tensor]]]:
+    def attempt(capacity: Sizes | None) -> tuple[Exchange, list[Tensor]]:
         exchange = transport.project_and_send(inputs, None, capacity)
         _, n_splats, n_isects = exchange.arrived
         projected, has_spare = exchange.projected, n_splats is not None
@@ -220,11 +205,10 @@ def render_queued(
             channels, image.render_mode != "RGB", rows_of, sh, *inputs.cameras, *options,
             image.backgrounds, n_isects, backward_follows, projected.totals if has_spare else None,
         )  # fmt: skip
-        return exchange, (exchange, outputs)
+        return exchange, outputs
 
-    result, (exchange, outputs) = run_attempts(transport, attempt)
-    assert exchange.totals is not None
-    splats, (visible, count, isects, *rest) = result.projected, exchange.totals
+    result, outputs = run_attempts(transport, attempt)
+    splats, (visible, count, isects, *rest) = result.projected, result.totals
     isect_splats, tile_offsets, *images = outputs[: _LISTS + _IMAGES]
     of_rows = outputs[_LISTS + _IMAGES :]
     if isect_splats.shape[0] > isects or (of_rows and of_rows[1].shape[0] > visible):
@@ -237,8 +221,8 @@ def render_queued(
         splats = splats._replace(colors=colors)
         rows = TableRows(inputs._replace(gaussians=found), numbers, indices, sh)
     has_blank_view = 0 in rest[VIEW_TOTALS - 3 :]
-    lists = Lists(isect_splats, tile_offsets, options.width, options.height, options.tile_size)
-    return Rendered(splats, lists, images, rows, has_blank_view)
+    grid = TileGrid(inputs.n_views, options.width, options.height, options.tile_size)
+    return Rendered(splats, Lists(isect_splats, tile_offsets, grid), images, rows, has_blank_view)
 
 
 @lru_cache(maxsize=16)

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from functools import reduce
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from blitzgs.call.arguments import Gaussians, Scene, Signals
+from blitzgs.call.arguments import Gaussians
 from blitzgs.call.bad_values import CamerasOnHost, check_intrinsics, watch_for_non_finite
 from blitzgs.call.channels import ImageOptions, channels_of, split_channels
 from blitzgs.call.extras import Pixels
@@ -35,7 +35,6 @@ _CHANNELS_AT_A_TIME = 64
 
 
 def render(
-    function: str,
     gaussians: Gaussians,
     projection: ProjectionOptions,
     image: ImageOptions,
@@ -45,13 +44,9 @@ def render(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render images; return the results of `blitzgs.rasterization`.
 
-    Args:
-        function: name of the public function, for warnings.
-        projection: options of the projection.
-        image: options of compositing.
-        tables: the SH, if only the rows of visible Gaussians are read; only where `groups_may_be_queued`.
-        job: the ranks among which the Gaussians and views are divided; None: this process has all of them.
-        groups: `groups_of` the Gaussians, which have SH, if they are already known.
+    `tables`: the SH, if only the rows of visible Gaussians are read; only where `groups_may_be_queued`.
+    `job`: the ranks among which the Gaussians and views are divided; None: this process has all of them.
+    `groups`: `groups_of` the Gaussians, which have SH, if they are already known.
     """
     compiling = torch.compiler.is_compiling()
     nan_marks: list[Tensor] = []
@@ -67,12 +62,12 @@ def render(
     else:
         cameras = None if compiling else CamerasOnHost(gaussians)
         splats = project_groups(groups, image.sparse_grad)
-    layout = Layout(splats, (*gaussians.lead, gaussians.opacities.shape[-1]), image.packed)
     # As in gsplat, Gaussians without a splat have their own opacity.
     over_all = not (image.packed or projection.antialiased or image.sparse_grad)
-    arranged = layout.rendered_columns(gaussians.opacities if over_all else None)
+    under = gaussians.opacities if over_all else None
+    layout = Layout(splats, (*gaussians.lead, gaussians.n_gaussians), image.packed, under)
     rendered, meta_geometry = layout.splats_to_composite(
-        arranged, gathered=compiling or job is not None, depths=image.render_mode != "RGB" or image.median
+        gathered=compiling or job is not None, depths=image.render_mode != "RGB" or image.median
     )
     channels = rendered.colors if only_colors else channels_of(rendered, gaussians, image)
     lead = gaussians.lead
@@ -90,8 +85,8 @@ def render(
     renders, alphas = rasterize(
         rendered.means2d, rendered.conics, rendered.opacities, channels,
         composited_lists.splats, composited_lists.offsets, n_cameras=images, width=projection.width,
-        height=projection.height, tile_size=composited_lists.tile_size, backgrounds=image.backgrounds,
-        store_absgrad=layout.absgrad_store(arranged["means2d"]) if image.absgrad else None,
+        height=projection.height, tile_size=composited_lists.grid.tile_size, backgrounds=image.backgrounds,
+        store_absgrad=layout.absgrad_store() if image.absgrad else None,
         composited=None if queued is None else queued.composited, meta_geometry=meta_geometry,
     )  # fmt: skip
     if not compiling:
@@ -101,11 +96,11 @@ def render(
         if queued is not None and queued.has_blank_view:
             check_intrinsics(gaussians.named["Ks"])
             suspects_cameras = True
-        watch_for_non_finite(gaussians, layout, function, nan_marks, suspects_cameras)
-    median = _median_depths(rendered, composited_lists, images, image.pixels) if image.median else None
+        watch_for_non_finite(gaussians, layout, nan_marks, suspects_cameras)
+    median = _median_depths(rendered, composited_lists, image.pixels) if image.median else None
     renders, alphas, others = _images_of_caller(renders, alphas, median, gaussians, image, lead)
     arrived = None if job is None else rendered
-    return renders, alphas, make_meta(gaussians, layout, {**arranged, **others}, lists, lead, arrived)
+    return renders, alphas, make_meta(gaussians, layout, others, lists, lead, arrived)
 
 
 def _images_of_caller(
@@ -118,11 +113,8 @@ def _images_of_caller(
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """Return images and alphas as the caller asked for them, and the further images of `meta` by key.
 
-    Args:
-        renders: all channels, [I, H, W, channels].
-        alphas: [I, H, W].
-        median: median depths, [I, H, W, 1] or of M pixels [M, 1]; None: not asked for.
-        lead: batch dimensions, and the number of views that are rendered here.
+    `renders`: all channels, [I, H, W, channels]. `alphas`: [I, H, W]. `median`: median depths, [I, H, W, 1]
+    or of M pixels [M, 1]. `lead`: batch dimensions, and the number of views that are rendered here.
     """
     alphas = alphas.unsqueeze(-1)
     if image.pixels is not None:
@@ -143,55 +135,47 @@ def _images_of_caller(
     return renders, alphas, others
 
 
-def _median_depths(splats: ProjectedSplats, lists: Lists, images: int, pixels: Pixels | None) -> Tensor:
+def _median_depths(splats: ProjectedSplats, lists: Lists, pixels: Pixels | None) -> Tensor:
     """Return the depth of the splat at which half the light of each pixel is gone, [I, H, W, 1] or [M, 1]."""
+    n_cameras, width, height, tile_size, *_ = lists.grid
     found = pixel_splats(
-        splats.means2d, splats.conics, splats.opacities, lists.splats, lists.offsets, n_cameras=images,
-        width=lists.width, height=lists.height, tile_size=lists.tile_size,
-        pixels=None if pixels is None else pixels.numbers,
+        splats.means2d, splats.conics, splats.opacities, lists.splats, lists.offsets, n_cameras=n_cameras,
+        width=width, height=height, tile_size=tile_size, pixels=None if pixels is None else pixels.numbers,
     )  # fmt: skip
     # Before the first splat stands the depth of a pixel without splats.
     table = torch.cat([splats.depths.new_zeros(1), splats.depths])
     depths = table.index_select(0, found.medians + 1)
-    return depths.view(-1, 1) if pixels is not None else depths.view(images, lists.height, lists.width, 1)
+    return depths.view(-1, 1) if pixels is not None else depths.view(n_cameras, height, width, 1)
 
 
-def _nan_or_zero(scene: Scene, valued: bool, signals: Signals | None) -> Tensor:
-    """Return [N]: NaN for a Gaussian with a colour or signal, in some view, that is not finite, 0 for others.
-
-    `valued`: whether its colours are values. `signals`: describes its extra signals.
-    """
-    tables = []
-    if valued:
-        assert scene.colors is not None
-        tables.append(scene.colors)
-    if signals is not None:
-        assert scene.extra_signals is not None
-        values = scene.extra_signals
-        if signals.sh_degree is not None:
-            values = values[:, : (signals.sh_degree + 1) ** 2].flatten(1)
-        tables.append(values)
-    totals = []
-    for table in tables:
-        # Zero times a number is zero unless the number is NaN or infinite. The product of a few channels at a
-        # time needs little memory.
-        parts = [(part * 0).sum(dim=-1) for part in table.detach().split(_CHANNELS_AT_A_TIME, dim=-1)]
-        total = parts[0] if len(parts) == 1 else torch.stack(parts).sum(dim=0)
-        totals.append(total if total.dim() == 1 else total.sum(dim=0))
-    return totals[0] if len(totals) == 1 else totals[0] + totals[1]
+def _nan_or_zero(table: Tensor) -> Tensor:
+    """Return [N] for a table [N, D] or [C, N, D]: NaN for a row with a value that is not finite, else 0."""
+    # Zero times a number is zero unless the number is NaN or infinite. The product of a few channels at a
+    # time needs little memory.
+    parts = [(part * 0).sum(dim=-1) for part in table.detach().split(_CHANNELS_AT_A_TIME, dim=-1)]
+    total = parts[0] if len(parts) == 1 else torch.stack(parts).sum(dim=0)
+    return total if total.dim() == 1 else total.sum(dim=0)
 
 
 def _without_non_finite(gaussians: Gaussians) -> tuple[Gaussians, list[Tensor]]:
     """Set the opacity of Gaussians to 0 whose colours or signals are not finite: NaN reaches no pixel.
 
-    SH are left to the projection. Also returns `_nan_or_zero` of each scene, or an empty list.
+    SH colours are left to the projection. Also returns for each scene [N], NaN for these Gaussians and 0 for
+    others; or an empty list.
     """
-    valued = gaussians.colors is not None and gaussians.sh_degree is None
-    if not valued and gaussians.signals is None:
+    columns, signals = [], gaussians.signals
+    if gaussians.colors is not None and gaussians.sh_degree is None:
+        columns.append(gaussians.named["colors"])
+    if signals is not None:
+        values = gaussians.named["extra_signals"]
+        if signals.sh_degree is not None:
+            values = tuple(own[:, : (signals.sh_degree + 1) ** 2].flatten(1) for own in values)
+        columns.append(values)
+    if not columns:
         return gaussians, []
-    nan_marks = [_nan_or_zero(scene, valued, gaussians.signals) for scene in gaussians.scenes]
-    scenes = [
+    nan_marks = [reduce(torch.add, map(_nan_or_zero, tables)) for tables in zip(*columns, strict=True)]
+    scenes = tuple(
         scene._replace(opacities=scene.opacities.masked_fill(value.isnan(), 0))
         for scene, value in zip(gaussians.scenes, nan_marks, strict=True)
-    ]
-    return replace(gaussians, scenes=tuple(scenes)), nan_marks
+    )
+    return gaussians._replace(scenes=scenes), nan_marks

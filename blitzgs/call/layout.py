@@ -19,7 +19,7 @@ from torch import Tensor
 import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs.call.extras import Pixels
 from blitzgs.ops.derivatives import linear_map
-from blitzgs.ops.intersect import TileGrid, tile_counts
+from blitzgs.ops.intersect import TileGrid
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
 from blitzgs.ops.rasterize import MetaGeometry
 
@@ -115,13 +115,19 @@ def _gradients_of_arranged(
 
 
 class Layout:
-    """The arrangement of P splats in `meta`: the visible ones if `packed`, or else all of all views."""
+    """The arrangement of P splats in `meta`: the visible ones if `packed`, or else all of all views.
 
-    def __init__(self, splats: ProjectedSplats, shape: tuple[int, ...], packed: bool) -> None:
+    Attribute `rendered` has the columns that the image depends on, arranged.
+    """
+
+    def __init__(
+        self, splats: ProjectedSplats, shape: tuple[int, ...], packed: bool, under: Tensor | None
+    ) -> None:
         """Compute the arrangement.
 
         `splats`: their camera_ids number all images of the call, their gaussian_ids the Gaussians of a scene.
-        `shape`: batch dimensions, C, and the Gaussians N of a scene.
+        `shape`: batch dimensions, C, and the Gaussians N of a scene. `under`: opacities of the Gaussians,
+        [..., N], where they have no splat; None: zero.
         """
         self.splats, self.packed = splats, packed
         self.places: Places | None = None  # of each splat in `meta`; None: the order is unchanged
@@ -130,54 +136,38 @@ class Layout:
         elif math.prod(shape[:-1]) > 1:
             order = torch.sort(splats.camera_ids, stable=True)[1]
             self.places = Places((order,), tuple(order.shape))
+        columns = (splats.means2d, splats.conics, splats.depths, splats.opacities)
+        means2d, conics, depths, opacities = self.arrange(*columns, under=under)
+        self.rendered = {"means2d": means2d, "conics": conics, "depths": depths, "opacities": opacities}
 
     def arrange(self, *columns: Tensor, under: Tensor | None = None) -> tuple[Tensor, ...]:
         """Arrange columns of splats as `Places.arrange` does."""
         return columns if self.places is None else self.places.arrange(columns, under)
 
-    def gather(self, *arranged: Tensor) -> tuple[Tensor, ...]:
-        """Gather the columns of the splats from arranged ones; the inverse of `arrange`."""
-        return arranged if self.places is None else self.places.gather(arranged)
-
-    def rendered_columns(self, under: Tensor | None) -> dict[str, Tensor]:
-        """Arrange the columns that the image depends on.
-
-        `under`: opacities of the Gaussians, [..., N], where they have no splat; None: zero.
-        """
-        splats = self.splats
-        columns = (splats.means2d, splats.conics, splats.depths, splats.opacities)
-        means2d, conics, depths, opacities = self.arrange(*columns, under=under)
-        return {"means2d": means2d, "conics": conics, "opacities": opacities, "depths": depths}
-
     def splats_to_composite(
-        self, arranged: dict[str, Tensor], gathered: bool, depths: bool
+        self, gathered: bool, depths: bool
     ) -> tuple[ProjectedSplats, MetaGeometry | None]:
-        """Return the splats to composite, so that their gradients reach `rendered_columns`.
+        """Return the splats to composite, and the geometry that gets the gradients in their place.
 
-        Args:
-            arranged: the `rendered_columns`.
-            gathered: gather the splats from them, as under `torch.compile` and where splats are sent on.
-                Otherwise the splats are as they are, and compositing arranges their gradients.
-            depths: whether an image depends on the depths.
-
-        Returns:
-            The splats; and the geometry that gets the gradients in their place, None: their own.
+        `gathered`: gather the splats from `rendered`, as under `torch.compile` and where splats are sent on.
+        Otherwise the splats are as they are, and compositing arranges their gradients. `depths`: whether an
+        image depends on the depths.
         """
-        if self.places is None:
-            return self.splats, None
+        splats, places, rendered = self.splats, self.places, self.rendered
+        if places is None:
+            return splats, None
         if gathered:
-            columns = self.gather(*arranged.values())
-            return self.splats._replace(**dict(zip(arranged, columns, strict=True))), None
-        splats = self.splats
+            columns = places.gather(list(rendered.values()))
+            return splats._replace(**dict(zip(rendered, columns, strict=True))), None
         if depths:
-            splats = splats._replace(depths=self.gather(arranged["depths"])[0])
-        geometry = [arranged[name] for name in ("means2d", "conics", "opacities")]
-        return splats, MetaGeometry(self.places.arrange, geometry)
+            splats = splats._replace(depths=places.gather([rendered["depths"]])[0])
+        geometry = [rendered[name] for name in ("means2d", "conics", "opacities")]
+        return splats, MetaGeometry(places.arrange, geometry)
 
-    def absgrad_store(self, means2d: Tensor) -> Callable[[Tensor], None]:
-        """Set `means2d.absgrad` to 0; return a function that fills it with the splats' gradients, [P, 2]."""
-        absgrad = torch.zeros_like(means2d)
-        means2d.absgrad = absgrad  # type: ignore[attr-defined]
+    def absgrad_store(self) -> Callable[[Tensor], None]:
+        """Zero means2d's `absgrad`; return a function that fills it with the splats' gradients, [P, 2]."""
+        absgrad = torch.zeros_like(self.rendered["means2d"])
+        self.rendered["means2d"].absgrad = absgrad  # type: ignore[attr-defined]
 
         def store(gradient: Tensor) -> None:
             absgrad.copy_(self.arrange(gradient)[0])
@@ -191,20 +181,8 @@ class Lists:
 
     splats: Tensor  # int32, splat indices; entries past the last offset are undefined
     offsets: Tensor  # int64 [I T + 1], where each tile's list begins
-    width: int  # image width in px
-    height: int  # image height in px
-    tile_size: int  # edge of a tile in px
+    grid: TileGrid  # the tiles
     _listed: Tensor | None = None
-
-    @property
-    def tiles_x(self) -> int:
-        """Number of tiles in a row."""
-        return tile_counts(self.width, self.height, self.tile_size)[0]
-
-    @property
-    def tiles_y(self) -> int:
-        """Number of tiles in a column."""
-        return tile_counts(self.width, self.height, self.tile_size)[1]
 
     def listed(self) -> Tensor:
         """Return `splats` without the undefined entries, which exist if splats are hidden."""
@@ -220,16 +198,18 @@ def lists_of(
 ) -> tuple[Lists, Lists]:
     """Return the tile lists for meta, and those to composite.
 
-    Args:
-        projection: the size of the images, and the caller's tile size.
-        count: number of entries of the lists for meta; -1: unknown.
-        pixels: the pixels that are rendered: the lists of tiles without any are empty, and those of the
-            others are as in the whole image, so that these pixels have the same bits. None: all.
+    `count`: number of entries of the lists for meta; -1: unknown. `pixels`: the pixels that are rendered: the
+    lists of tiles without any are empty, and those of the others are as in the whole image, so that these
+    pixels have the same bits. None: all.
     """
 
     def listed_by(edge: int, n_isects: int) -> Lists:
         grid = TileGrid(images, projection.width, projection.height, edge)
-        return _lists(splats, grid, n_isects) if pixels is None else _lists_of_pixels(splats, grid, pixels)
+        if pixels is not None:
+            return _lists_of_pixels(splats, grid, pixels)
+        own = (splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids)
+        entries, offsets = torch.ops.blitzgs.intersect(*own, None, *grid, n_isects, None, True)
+        return Lists(entries, offsets, grid)
 
     lists = listed_by(projection.tile_size, count)
     if not splats.means2d.is_cuda or projection.tile_size == CUDA_TILE_SIZE:
@@ -237,33 +217,19 @@ def lists_of(
     return lists, listed_by(CUDA_TILE_SIZE, -1)
 
 
-def _lists(splats: ProjectedSplats, grid: TileGrid, n_isects: int) -> Lists:
-    isect_splats, offsets = torch.ops.blitzgs.intersect(
-        splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, None,
-        *grid, n_isects, None, True,
-    )  # fmt: skip
-    return Lists(isect_splats, offsets, grid.width, grid.height, grid.tile_size)
-
-
 def _lists_of_pixels(splats: ProjectedSplats, grid: TileGrid, pixels: Pixels) -> Lists:
-    edge = grid.tile_size
-    columns, rows = tile_counts(grid.width, grid.height, edge)
+    edge, (columns, rows) = grid.tile_size, grid.tiles
     wanted = torch.zeros(grid.n_cameras, rows, columns, dtype=torch.bool, device=splats.means2d.device)
     wanted[pixels.images, pixels.rows // edge, pixels.columns // edge] = True
     near = _splats_near(splats, wanted, edge)
-    own = [t.detach().index_select(0, near) for t in (splats.means2d, splats.conics, splats.opacities)]
-    depths, camera_ids = (t.detach().index_select(0, near) for t in (splats.depths, splats.camera_ids))
-    listed, offsets = torch.ops.blitzgs.intersect(*own, depths, camera_ids, None, *grid, -1, None, True)
+    own = (splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids)
+    chosen = [column.detach().index_select(0, near) for column in own]
+    listed, offsets = torch.ops.blitzgs.intersect(*chosen, None, *grid, -1, None, True)
     lengths, count = offsets.diff(), int(offsets[-1])
     kept = wanted.view(-1).repeat_interleave(lengths, output_size=count)
     ends = (lengths * wanted.view(-1)).cumsum(0)
-    return Lists(
-        near.index_select(0, listed[:count][kept]).int(),
-        torch.cat([ends.new_zeros(1), ends]),
-        grid.width,
-        grid.height,
-        edge,
-    )
+    entries = near.index_select(0, listed[:count][kept]).int()
+    return Lists(entries, torch.cat([ends.new_zeros(1), ends]), grid)
 
 
 def _splats_near(splats: ProjectedSplats, wanted: Tensor, edge: int) -> Tensor:

@@ -127,7 +127,7 @@ for _class in (LazyDict, LateMapping):
 def make_meta(
     gaussians: Gaussians,
     layout: Layout,
-    known: Mapping[str, Any],
+    others: Mapping[str, Tensor],
     lists: Lists,
     lead: tuple[int, ...],
     arrived: ProjectedSplats | None,
@@ -136,16 +136,15 @@ def make_meta(
 
     Under `torch.compile` it is a plain dict, and the compiler removes entries that the caller does not read.
 
-    `known`: the rendered columns in this arrangement, and further images. `lead`: batch dimensions, and the
+    `others`: further images by key. `lead`: batch dimensions, and the
     number of views that are rendered here. `arrived`: the splats that `lists` refers to, if ranks have
     exchanged splats; None: those of `layout`.
     """
     entries = _Entries(gaussians, layout, lists, lead, arrived)
-    numbers = {
-        "tile_size": lists.tile_size, "width": lists.width, "height": lists.height,
-        "n_batches": len(gaussians.scenes), "n_cameras": lead[-1],
+    known = {
+        "tile_size": lists.grid.tile_size, "width": lists.grid.width, "height": lists.grid.height,
+        "n_batches": len(gaussians.scenes), "n_cameras": lead[-1], **layout.rendered, **others,
     }  # fmt: skip
-    known = {**numbers, **known}
     if torch.compiler.is_compiling():
         return {**{key: known[key] if key in known else entries.of(key) for key in _KEYS}, **known}
     return LazyDict({**_NOTHING_KNOWN, **known}, entries.of)
@@ -185,37 +184,35 @@ class _Entries(NamedTuple):
         return self.layout.arrange(self.layout.splats.tiles_touched)[0]
 
     def tile_width(self) -> int:
-        return self.lists.tiles_x
+        return self.lists.grid.tiles[0]
 
     def tile_height(self) -> int:
-        return self.lists.tiles_y
+        return self.lists.grid.tiles[1]
 
     def isect_ids(self) -> Tensor:
         splats = self.layout.splats if self.arrived is None else self.arrived
-        return _isect_ids(splats.depths, self.lists, math.prod(self.lead))
+        return _isect_ids(splats.depths, self.lists)
 
     def flatten_ids(self) -> Tensor:
         listed, places = self.lists.listed(), self.layout.places
-        return (
-            listed
-            if places is None or self.arrived is not None
-            else places.flat().index_select(0, listed).int()
-        )
+        if places is None or self.arrived is not None:
+            return listed
+        return places.flat().index_select(0, listed).int()
 
     def isect_offsets(self) -> Tensor:
-        return self.lists.offsets[:-1].reshape(*self.lead, self.lists.tiles_y, self.lists.tiles_x)
+        return self.lists.offsets[:-1].reshape(*self.lead, *self.lists.grid.tiles[::-1])
 
     def non_finite(self) -> LateMapping:
         return LateMapping(lambda: non_finite(self.gaussians))
 
 
-def _isect_ids(depths: Tensor, lists: Lists, images: int) -> Tensor:
+def _isect_ids(depths: Tensor, lists: Lists) -> Tensor:
     """Return gsplat's sort keys, int64: image | tile | float32 depth bits, from high to low."""
     depths = depths.detach().index_select(0, lists.listed())
     entries = torch.arange(len(depths), device=depths.device)
     keys = torch.searchsorted(lists.offsets[1:], entries, right=True)
-    n_tiles = lists.tiles_x * lists.tiles_y
-    if images > 1:
+    n_tiles = math.prod(lists.grid.tiles)
+    if lists.grid.n_cameras > 1:
         # The bits of n_tiles. Its `bit_length()` would compile a graph for every number of tiles.
         tiles = torch.full((), n_tiles, dtype=torch.float64, device=depths.device)
         keys = (keys // n_tiles << torch.frexp(tiles).exponent) | keys % n_tiles

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -34,22 +33,12 @@ class CallRanks(NamedTuple):
 def gather_views(
     gaussians: Gaussians, absgrad: bool, same: Sequence[Any]
 ) -> tuple[Gaussians, CallRanks | None]:
-    """Return this rank's Gaussians with the views of all ranks, M C, in the order of ranks.
+    """Return this rank's Gaussians with the views of all ranks, M C, in the order of ranks. Collective.
 
-    Collective.
-
-    Args:
-        gaussians: one scene, with the rank's own views.
-        absgrad: whether absolute gradients are asked for, which ranks do not exchange.
-        same: values that must be equal on all ranks.
-
-    Returns:
-        The Gaussians, and the job; None if there is one rank.
-
-    Raises:
-        ValueError: there are batch dimensions, colours per view or absolute gradients; or, on every rank: the
-            ranks differ in `same`, in their number of views, or in whether
-            Gaussians or poses need gradients. Some ranks would then wait for others forever.
+    `gaussians`: one scene, with the rank's own views. `same`: values that must be equal on all ranks. Also
+    returns the job; None if there is one rank. ValueError: there are batch dimensions, colours per view or
+    absolute gradients, which ranks do not exchange; or, on every rank: the ranks differ in `same`, in their
+    number of views, or in whether Gaussians or poses need gradients, and would wait for others forever.
     """
     per_view = gaussians.per_view or (gaussians.signals is not None and gaussians.signals.per_view)
     if len(gaussians.lead) > 1 or per_view or absgrad:
@@ -61,17 +50,17 @@ def gather_views(
         return gaussians, None
     job = CallRanks(Ranks(dist.get_rank(), dist.get_world_size()), gaussians.views)
     scene, recorded = gaussians.scenes[0], torch.is_grad_enabled()
-    inputs = scene._replace(Ks=scene.means)  # Ks get no gradient
-    need = recorded and any(t is not None and t.requires_grad for t in inputs[:8])
+    extra = None if gaussians.signals is None else gaussians.signals.values
+    learned = (scene.means, scene.quats, scene.scales, scene.opacities, scene.colors, extra)
     need_poses = recorded and scene.viewmats.requires_grad
-    channels = None if gaussians.colors is None else gaussians.colors.shape[-1]
-    signals = None if gaussians.signals is None else gaussians.signals.channels
-    own = (gaussians.views, *same, channels, signals, need, need_poses)
+    need = need_poses or (recorded and any(t is not None and t.requires_grad for t in learned))
+    channels = [None if t is None else t.shape[-1] for t in (scene.colors, extra)]
+    own = (gaussians.views, *same, *channels, need, need_poses)
     _require_same(own, job.ranks, scene.viewmats.device)
     viewmats = _all_poses(scene.viewmats, job)
     Ks = torch.cat(job.ranks.all_gather(scene.Ks.detach().contiguous()))
     scene = scene._replace(viewmats=viewmats, Ks=Ks)
-    return replace(gaussians, scenes=(scene,), lead=(len(viewmats),)), job
+    return gaussians._replace(scenes=(scene,), lead=(len(viewmats),)), job
 
 
 def _require_same(given: tuple[Any, ...], ranks: Ranks, device: torch.device) -> None:

@@ -9,16 +9,17 @@ import torch
 from torch import Tensor
 
 from blitzgs.call.arguments import (
+    CAMERA_MODELS,
     DEFAULT_TILE_SIZE,
+    RENDER_MODES,
+    check_choice,
     check_further,
-    check_options,
     check_tensors,
+    checked_options,
     gaussians_of,
 )
-from blitzgs.call.bad_values import warn_of_gradient
 from blitzgs.call.channels import ImageOptions, background_rows
 from blitzgs.call.extras import (
-    check_with_ut,
     check_without_ut,
     checked_pixels,
     with_covariances,
@@ -27,7 +28,6 @@ from blitzgs.call.extras import (
 )
 from blitzgs.call.images import render
 from blitzgs.call.ranks import gather_views
-from blitzgs.ops.projection_types import ProjectionOptions
 from blitzgs.util.errors import explain_memory
 
 # Colours of networks under autocast, and of SH tables in half precision.
@@ -189,11 +189,11 @@ def rasterization(
     """
     if further:
         check_further("rasterization", further)
-    tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
-    check_options(
-        width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size, render_mode,
-        rasterize_mode, camera_model,
-    )  # fmt: skip
+    projection = checked_options(
+        width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size, rasterize_mode
+    )
+    check_choice("render_mode", render_mode, RENDER_MODES)
+    check_choice("camera_model", camera_model, CAMERA_MODELS)
     if isinstance(colors, Tensor) and colors.dtype in _HALF and isinstance(means, Tensor):
         colors = colors.to(means.dtype)
     if isinstance(extra_signals, Tensor) and extra_signals.dtype in _HALF and isinstance(means, Tensor):
@@ -209,18 +209,16 @@ def rasterization(
     }
     given = {"colors": colors, "backgrounds": backgrounds, "covars": covars, "extra_signals": extra_signals}
     check_tensors(required, given | lens)
-    if with_ut:
-        refused = {"covars": covars is not None, "sparse_grad": sparse_grad, "distributed": distributed}
-        check_with_ut(viewmats, refused)
-    elif camera_model != "pinhole" or (rolling_shutter, ut_params, *lens.values()) != (None,) * 6:
+    of_lenses = (rolling_shutter, ut_params, *lens.values())
+    if not with_ut and (camera_model != "pinhole" or of_lenses != (None,) * 6):
         check_without_ut(camera_model, rolling_shutter, {**lens, "ut_params": ut_params})
-    if Ks.requires_grad:
-        warn_of_gradient("rasterization")
     if covars is not None:
         # Placeholders, which the decomposition of the covariances replaces.
         quats, scales = (means.new_zeros(()).expand(*means.shape[:-1], length) for length in (4, 3))
     assert quats is not None and scales is not None
-    gaussians = gaussians_of(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, render_mode)
+    gaussians = gaussians_of(
+        "rasterization", means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, render_mode
+    )
     if sparse_grad and len(gaussians.lead) > 1:
         raise ValueError("sparse_grad does not support batch dimensions; leave one of them out")
     if extra_signals is not None:
@@ -230,11 +228,8 @@ def rasterization(
     if covars is not None:
         gaussians = with_covariances(gaussians, covars, sparse_grad, return_normals)
     if with_ut:
-        gaussians = with_lenses(gaussians, camera_model, rolling_shutter, ut_params, **lens)
-    degree, antialiased = sh_degree or 0, rasterize_mode == "antialiased"
-    projection = ProjectionOptions(
-        width, height, tile_size, degree, near_plane, far_plane, eps2d, radius_clip, antialiased, False
-    )
+        refused = {"covars": covars is not None, "sparse_grad": sparse_grad, "distributed": distributed}
+        gaussians = with_lenses(gaussians, camera_model, rolling_shutter, ut_params, refused, **lens)
     background = None
     if backgrounds is not None:
         background = background_rows(backgrounds, gaussians, render_mode, return_normals)
@@ -248,10 +243,10 @@ def rasterization(
     )
     job = None
     if distributed:
-        same = (width, height, tile_size, render_mode, return_normals)
+        same = (width, height, projection.tile_size, render_mode, return_normals)
         gaussians, job = gather_views(gaussians, absgrad, same)
     try:
-        return render("rasterization", gaussians, projection, image, job=job)
+        return render(gaussians, projection, image, job=job)
     except (RuntimeError, MemoryError) as error:
         explain_memory(error, gaussians.images, width, height, means.shape[-2], means.device)
         raise

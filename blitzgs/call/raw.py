@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Iterable, Mapping
+from functools import cache
 from typing import Any, Protocol
 
 import torch
@@ -12,20 +14,21 @@ from torch import Tensor
 
 from blitzgs._torch import not_compiled
 from blitzgs.call.arguments import (
+    ANY,
     DEFAULT_TILE_SIZE,
+    GSPLAT_DEFAULTS,
     KERNEL_SH_DEGREE,
-    RAW_DEFAULTS,
-    Gaussians,
+    RENDER_MODES,
+    check_choice,
     check_further,
-    check_options,
     check_tensors,
+    checked_options,
     gaussians_of,
 )
-from blitzgs.call.bad_values import warn_of_gradient
 from blitzgs.call.channels import ImageOptions, background_rows
 from blitzgs.call.groups import ShTables, gathered_groups, groups_may_be_queued, groups_of
 from blitzgs.call.images import render
-from blitzgs.ops.projection_types import ProjectionOptions
+from blitzgs.call.rasterize import rasterization
 from blitzgs.ops.rows import of_shape
 
 
@@ -115,16 +118,13 @@ def raw_rasterization(
         RuntimeError: float64 tensors are on a GPU, or the call is inside a transform of `torch.func`.
     """
     if further:
-        check_further("raw_rasterization", further, RAW_DEFAULTS)
-    tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
-    check_options(
-        width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size, render_mode,
-        rasterize_mode, "pinhole",
-    )  # fmt: skip
+        check_further("raw_rasterization", further, _defaults())
+    projection = checked_options(
+        width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size, rasterize_mode, True
+    )
+    check_choice("render_mode", render_mode, RENDER_MODES)
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh0": sh0}
     check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks}, {"shN": shN, "backgrounds": backgrounds})
-    if Ks.requires_grad:
-        warn_of_gradient("raw_rasterization")
     if means.dim() != 2:
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
     shaded = "RGB" in render_mode
@@ -137,11 +137,10 @@ def raw_rasterization(
     if sh0.dim() == 2 and sh0.shape[1] == 3:
         tensors["sh0"] = sh0 = harmonics[0] = of_shape(sh0, (len(sh0), 1, 3))
     sh_degree = _checked_degree(harmonics, len(means), sh_degree, shaded)
-    antialiased = rasterize_mode == "antialiased"
-    projection = ProjectionOptions(
-        width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, True
+    projection = projection._replace(sh_degree=sh_degree)
+    whole = gaussians_of(
+        "raw_rasterization", means, quats, scales, opacities, None, viewmats, Ks, None, "D", raw=True
     )
-    whole = gaussians_of(means, quats, scales, opacities, None, viewmats, Ks, None, "D", raw=True)
     if sparse_grad and torch.is_grad_enabled():
         _check_leaves(params | sh_params if shaded else params)
     lazy = _lazy(optimizers)
@@ -152,7 +151,7 @@ def raw_rasterization(
         del given["sh0"], given["shN"]
     named = {name: (tensor,) for name, tensor in given.items() if tensor is not None}
     colors, degree = (sh0, sh_degree) if shaded else (None, None)
-    gaussians = Gaussians(whole.scenes, colors, opacities, degree, False, whole.lead, True, named)
+    gaussians = whole._replace(colors=colors, sh_degree=degree, named=named)
     background = background_rows(backgrounds, gaussians, render_mode)
     image = ImageOptions(render_mode, background, True, sparse_grad, absgrad)
 
@@ -163,10 +162,18 @@ def raw_rasterization(
     groups = groups_of(gaussians, projection)
     tables = ShTables(harmonics if shaded else (), catch_up_sh)
     if groups_may_be_queued(groups):
-        return render("raw_rasterization", gaussians, projection, image, tables=tables, groups=groups)
+        return render(gaussians, projection, image, tables=tables, groups=groups)
     # Several groups, no Gaussians, or another tile size: gather the Gaussians that any group sees.
     groups = gathered_groups(groups, tables)
-    return render("raw_rasterization", gaussians, projection, image, groups=groups)
+    return render(gaussians, projection, image, groups=groups)
+
+
+@cache
+def _defaults() -> dict[str, Any]:
+    """Return what only `rasterization` takes, with the defaults; other values are not supported here."""
+    parameters = inspect.signature(rasterization).parameters.values()
+    given = {p.name: p.default for p in parameters if p.default is not p.empty}
+    return {**GSPLAT_DEFAULTS, **given, "channel_chunk": ANY, "segmented": ANY}
 
 
 def _check_leaves(params: Mapping[str, Tensor]) -> None:

@@ -230,10 +230,8 @@ def _project(
         if not unit:
             # In double, because the decomposition of a thin Gaussian loses digits.
             shapes = quaternion_matrices(rotations.double()) * scales.double()[:, None]
-            covariances = decompose(shapes @ shapes.mT)
-            decomposed = Decomposed(
-                covariances.upper, covariances.quats.to(means.dtype), covariances.scales.to(means.dtype)
-            )
+            upper, *axes = decompose(shapes @ shapes.mT)
+            decomposed = Decomposed(upper, *(t.to(means.dtype) for t in axes))
     if decomposed is not None:
         rotations, scales = decomposed.quats, decomposed.scales
     assert rotations is not None and scales is not None

@@ -21,16 +21,15 @@ from torch import Tensor
 
 from blitzgs._library import below_autograd
 from blitzgs.frame.tiles import TileAssignment
-from blitzgs.frame.transport import (
+from blitzgs.frame.transport import open_transport
+from blitzgs.frame.transport.protocol import (
     Arrived,
     Exchange,
-    Traffic,
+    ExchangeResult,
     Transport,
     WayBack,
-    open_transport,
     stage_ended,
 )
-from blitzgs.frame.transport.protocol import ExchangeResult
 from blitzgs.ops.blocks import ActiveRows, GateRules
 from blitzgs.ops.intersect import TileGrid
 from blitzgs.ops.projection_types import (
@@ -101,7 +100,6 @@ class Frame(NamedTuple):
     splats: Splats  # the splats that this rank composited: its own, or those that it received
     assignment: TileAssignment | None  # the tiles of each rank; None: one rank composites all
     way_back: WayBack | None  # returns the gradients of splats to their owners; None: one rank owns all
-    traffic: Traffic | None  # numbers of splats sent between the ranks; None: none were sent
     # int64 [B], Gaussians visible in each view, over all ranks; valid until the next exchange.
     visible: Tensor
     active: ActiveRows | None  # rows that were considered, and the views of each; None: all
@@ -159,7 +157,6 @@ def render_frame(
         splats=splats,
         assignment=assignment,
         way_back=result.way_back,
-        traffic=result.traffic,
         visible=result.visible,
         active=rows,
         renders=renders,
@@ -242,17 +239,11 @@ def backward_splats(frame: Frame, v_renders: Tensor) -> SplatGradients:
     grid = TileGrid(len(views), views.width, views.height, options.tile_size, *tiles)
     if way_back is not None:
         way_back.check_still_valid()
-    if v_renders.is_cuda:
-        table = frame.gradients.take(frame.splats.means2d)
-        torch.ops.blitzgs.rasterize_bwd(
-            *frame.saved, v_renders, None, *grid, False, options.deterministic, table
-        )
-        gradients = SplatGradients([table])
-    else:
-        *parts, _ = torch.ops.blitzgs.rasterize_bwd(
-            *frame.saved, v_renders, None, *grid, False, options.deterministic
-        )
-        gradients = SplatGradients(parts)
+    table = frame.gradients.take(frame.splats.means2d) if v_renders.is_cuda else None
+    *parts, _ = torch.ops.blitzgs.rasterize_bwd(
+        *frame.saved, v_renders, None, *grid, False, options.deterministic, table
+    )
+    gradients = SplatGradients(parts if table is None else [table])
     stage_ended("raster back")
     if way_back is not None:
         gradients = way_back.return_gradients(gradients)
@@ -272,18 +263,11 @@ def run_attempts(
 ) -> tuple[ExchangeResult, Outputs]:
     """Queue a frame's work, without gradients, until all results had enough memory.
 
-    Args:
-        transport: estimates the sizes.
-        attempt: given the capacity (None: the sizes are not known, and the work waits for them), projects
-            and sends the splats with `transport`, and queues the work with those that arrive. It returns the
-            exchange and the outputs of this work, and keeps neither: another attempt needs their memory.
-
-    Returns:
-        The splats, cut to their numbers, and the outputs of the last attempt.
-
-    Raises:
-        RuntimeError: `MAX_ATTEMPTS` attempts did not suffice, each with the sizes that the last one
-            needed.
+    `attempt`: given the capacity that `transport` estimates (None: the sizes are not known, and the work
+    waits for them), projects and sends the splats with `transport`, and queues the work with those that
+    arrive. It returns the exchange and the outputs of this work, and keeps neither: another attempt needs
+    their memory. Returns the splats, cut to their numbers, and the outputs of the last attempt. RuntimeError:
+    `MAX_ATTEMPTS` attempts did not suffice, each with the sizes that the last one needed.
     """
     for _ in range(MAX_ATTEMPTS):
         capacity = None if transport.estimate is None else transport.estimate.sizes

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs._library import below_autograd
+from blitzgs.ops.projection_types import Views
 
 BLOCK_ROWS = 256
 # Optimiser state that bounds how far rows may move when their pending steps are applied: first and second
@@ -68,8 +68,7 @@ class ActiveRows(NamedTuple):
 def morton_keys(points: Tensor) -> Tensor:
     """Return each point's position along the Morton curve of the cloud's bounding cube.
 
-    `points`: float32 [N, 3]. Returns int64 [N]; 2^63 - 1 for a point that is not finite. RuntimeError: wrong
-    shape or dtype.
+    `points`: float32 [N, 3]. Returns int64 [N]; 2^63 - 1 for a point that is not finite.
     """
     return torch.ops.blitzgs.morton_keys(points)
 
@@ -85,10 +84,7 @@ def update_block_bounds_(
         ids: int32 [U], rows that changed.
         means: float32 [N, 3].
         scales: float32 [N, 3], logarithms of the standard deviations.
-        pending: bounds how far rows may move when pending steps are applied; None: there are none.
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes.
+        pending: `PendingSteps`; None: there are none.
     """
     with below_autograd():
         torch.ops.blitzgs.update_block_bounds_(bounds, ids, _rows(means, scales, pending))
@@ -98,19 +94,14 @@ def cull_blocks(
     bounds: Tensor,
     means: Tensor,
     scales: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    near_plane: float,
-    far_plane: float,
-    eps2d: float = 0.3,
+    views: Views,
+    limits: tuple[float, float, float],
     pending: PendingSteps | None = None,
     level_ranges: Tensor | None = None,
     rules: GateRules | None = None,
     capacity_blocks: int | None = None,
 ) -> ActiveRows:
-    """Return the rows that at least one of B views may see; rows of blocks outside all views are not read.
+    """Return the rows that at least one of the views (32 at most) may see; blocks outside all are not read.
 
     The set is conservative: it contains every row that projection would project, however many of its pending
     steps have been applied by then. A row is dropped from a view only if it certainly misses that view
@@ -120,13 +111,8 @@ def cull_blocks(
         bounds: from `update_block_bounds_`, of the same rows.
         means: float32 [N, 3].
         scales: float32 [N, 3], logarithms of the standard deviations.
-        viewmats: float32 [B, 4, 4], world to camera, B <= 32.
-        Ks: float32 [B, 3, 3], pixels.
-        width: pixels.
-        height: pixels.
-        near_plane: rows at z <= near_plane are not seen.
-        far_plane: rows at z > far_plane are not seen.
-        eps2d: screen-space blur, pixels squared.
+        limits: near plane, far plane (rows at z <= near or z > far are not seen), and eps2d, the blur on the
+            screen, pixels squared.
         pending: as given to `update_block_bounds_`.
         level_ranges: uint8 [ceil(N / 256), 2], coarsest and finest level of each block; needed for `rules`.
         rules: also drop the rows that these rules leave out wherever their pending steps may move them;
@@ -135,22 +121,15 @@ def cull_blocks(
             blocks as the views may see; the host then waits for this number.
 
     Raises:
-        RuntimeError: wrong shapes or dtypes, more than 32 views, or as `gate_views_` says.
+        RuntimeError: as `gate_views_`.
     """
-    ids, views, length, blocks = torch.ops.blitzgs.cull_blocks(
-        bounds,
-        _rows(means, scales, pending),
-        viewmats,
-        Ks,
-        width,
-        height,
-        near_plane,
-        far_plane,
-        eps2d,
-        *(() if rules is None else (level_ranges, *rules)),
-        capacity_blocks=capacity_blocks,
+    cameras = (views.viewmats, views.Ks, views.width, views.height)
+    gate = () if rules is None else (level_ranges, *rules)
+    rows = _rows(means, scales, pending)
+    found = torch.ops.blitzgs.cull_blocks(
+        bounds, rows, *cameras, *limits, *gate, capacity_blocks=capacity_blocks
     )
-    return ActiveRows(ids, views, length, blocks)
+    return ActiveRows(*found)
 
 
 def gate_views_(active: ActiveRows, means: Tensor, viewmats: Tensor, rules: GateRules) -> None:
@@ -163,8 +142,7 @@ def gate_views_(active: ActiveRows, means: Tensor, viewmats: Tensor, rules: Gate
         rules: which rows each view leaves out.
 
     Raises:
-        RuntimeError: wrong shapes or dtypes, more than 32 views, no level, finer levels that reach farther,
-            or a column that the cull matrix lacks.
+        RuntimeError: no level, finer levels that reach farther, or a column that the cull matrix lacks.
     """
     level, reach, lod_views, cull, columns = rules
     with below_autograd():
@@ -193,19 +171,13 @@ def sectors_of_rows(rows: Tensor) -> Tensor:
     Returns:
         int32 [ceil(N / 256), 32 words, 8]: for each block of 256 rows and column the 32 bytes of the rows'
         bits; bit r % 32 of word r / 32 is that of the block's row r. Rows beyond N have zeros.
-
-    Raises:
-        RuntimeError: a wrong shape or dtype.
     """
     return torch.ops.blitzgs.sectors_of_rows(rows)
 
 
 @torch.no_grad()
 def rows_of_sectors(sectors: Tensor, n: int) -> Tensor:
-    """Convert a mask of N rows back to the layout by row, int32 [N, words]; the inverse of `sectors_of_rows`.
-
-    RuntimeError: a wrong shape or dtype.
-    """
+    """Convert a mask of N rows back to the layout by row, int32 [N, words]: undo `sectors_of_rows`."""
     return torch.ops.blitzgs.rows_of_sectors(sectors, n)
 
 
@@ -222,8 +194,9 @@ def seen_blocks(
 
     A block without the bit of a view has no row that `blitzgs.ops.blocks.cull_blocks` lists for that view.
 
-    Arguments and errors are those of `cull_blocks`, but for `sizes`, int32 [V, 2]: width and height of each
-    of the V views, pixels. Returns int32 [blocks], bit v set when view v may see a part of the block.
+    `bounds`: from `update_block_bounds_`. `viewmats`, `Ks`: float32 [V, 4, 4] and [V, 3, 3]. `sizes`: int32
+    [V, 2], width and height of each of the V views, pixels. The others are the limits of `cull_blocks`.
+    Returns int32 [blocks], bit v set when view v may see a part of the block.
     """
     return torch.ops.blitzgs.seen_blocks(bounds, viewmats, Ks, sizes, near_plane, far_plane, eps2d)
 

@@ -59,12 +59,8 @@ def sampling_keys(weights: Tensor, ids: Tensor, seed: int, event: int) -> Tensor
 
     Returns:
         float32 [N].
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes.
     """
-    keys: Tensor = torch.ops.blitzgs.sampling_keys(weights, ids, seed, event)
-    return keys
+    return torch.ops.blitzgs.sampling_keys(weights, ids, seed, event)
 
 
 @torch.no_grad()
@@ -79,12 +75,8 @@ def key_histogram(keys: Tensor, prefix: Tensor, shift: int, width: int) -> Tenso
 
     Returns:
         int64 [2^width].
-
-    Raises:
-        RuntimeError: wrong shapes, dtypes or bits.
     """
-    counts: Tensor = torch.ops.blitzgs.key_histogram(keys, prefix, shift, width)
-    return counts
+    return torch.ops.blitzgs.key_histogram(keys, prefix, shift, width)
 
 
 def find_digit_(search: Tensor, counts: Tensor) -> None:
@@ -95,14 +87,10 @@ def find_digit_(search: Tensor, counts: Tensor) -> None:
             found under them, from 1 on; and how many keys have them, which is only written. If there are too
             few keys, the last digit is taken.
         counts: of the keys by their next digit, int64 [2^width].
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes.
     """
     torch.ops.blitzgs.find_digit_(search, counts)
 
 
 def keys_up_to(keys: Tensor, limit: Tensor) -> Tensor:
     """Mark the keys, float32 [N], whose ordered bits are at most `limit` (int64 [1]); bool [N]."""
-    marks: Tensor = torch.ops.blitzgs.keys_up_to(keys, limit)
-    return marks
+    return torch.ops.blitzgs.keys_up_to(keys, limit)

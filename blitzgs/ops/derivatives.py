@@ -24,13 +24,9 @@ def first_only(
     would silently be zero. When torch records the backward pass (`create_graph=True`), this function
     therefore connects the gradients with all inputs through a function whose backward pass raises an error.
 
-    Args:
-        op: name of the op, for the error.
-        compute: returns gradients of the op's inputs; autograd records nothing of it.
-        inputs: tensors that the gradients depend on: the op's inputs and the gradients of its outputs.
-
-    Raises:
-        RuntimeError: the backward pass runs under vmap.
+    `op`: its name, for errors. `compute`: returns gradients of the op's inputs; autograd records nothing of
+    it. `inputs`: what these depend on: the op's inputs and the gradients of its outputs. RuntimeError: the
+    backward pass runs under vmap.
     """
     recorded = torch.is_grad_enabled()
     try:
@@ -63,11 +59,7 @@ def linear_map(
 ) -> tuple[Tensor, ...]:
     """Apply a linear map to tensors, with the gradient that its adjoint gives.
 
-    Args:
-        forward: maps the inputs to the outputs; autograd records nothing of it.
-        adjoint: maps the gradients of the outputs, None for zero, to those of the inputs.
-        inputs: of `forward`.
-        saved: tensors without gradients for `adjoint`.
+    Autograd records nothing of `forward`. `saved`: tensors without gradients for `adjoint`.
     """
     outputs: tuple[Tensor, ...] = _LinearMap.apply(forward, adjoint, saved, *inputs)  # type: ignore[no-untyped-call]
     return outputs

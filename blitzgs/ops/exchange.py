@@ -21,24 +21,20 @@ def scatter_splats(
     """Copy each splat into the groups of the ranks that it is sent to.
 
     Args:
-        columns: [P, ...] each, of any dtype of 2, 4 or 8 bytes; at most 8. Splats of an odd number of 2-byte
-            elements are padded to whole words.
+        columns: [P, ...] each, of any dtype of 4 or 8 bytes; at most 8.
         masks: int64 [P]; bit m sends a splat to rank m.
         group_sizes: splats for each of the M ranks, as the masks have them.
 
     Returns:
         packed int32 [words]: one group after the other, in each the columns one after the other; and places
         int64 [ceil(P / PLACE_SPLATS), M], where in each group the splats are: what
-        `splat_gradients.sum_splats` needs. The order of the splats of a run is kept; on CUDA that of runs is
+        `SplatGradients.sum_returned` needs. The order of the splats of a run is kept; on CUDA that of runs is
         not.
 
     Raises:
         RuntimeError: columns of different lengths, or too many.
     """
-    packed, places = torch.ops.blitzgs.scatter_splats(
-        [words_of(c) for c in columns], masks, list(group_sizes)
-    )
-    return packed, places
+    return torch.ops.blitzgs.scatter_splats([words_of(c) for c in columns], masks, list(group_sizes))
 
 
 def gather_splats(packed: Tensor, like: Sequence[Tensor], group_sizes: Sequence[int]) -> list[Tensor]:
@@ -57,7 +53,10 @@ def gather_splats(packed: Tensor, like: Sequence[Tensor], group_sizes: Sequence[
     """
     widths = [words_per_splat(column) for column in like]
     parts = torch.ops.blitzgs.gather_splats(packed, widths, list(group_sizes))
-    return [as_column(part, column) for part, column in zip(parts, like, strict=True)]
+    return [
+        words.view(column.dtype).reshape(-1, *column.shape[1:])
+        for words, column in zip(parts, like, strict=True)
+    ]
 
 
 def place_runs(splats: int) -> int:
@@ -67,25 +66,17 @@ def place_runs(splats: int) -> int:
 
 def words_per_splat(column: Tensor) -> int:
     """Return how many 32-bit words one splat takes in a column."""
-    return -(-math.prod(column.shape[1:]) * column.element_size() // 4)
+    return math.prod(column.shape[1:]) * column.element_size() // 4
 
 
 def words_of(column: Tensor) -> Tensor:
     """View a column [P, ...] as int32 [P, words]."""
     flat = column.reshape(len(column), math.prod(column.shape[1:]))
-    if flat.element_size() == 2 and flat.shape[1] % 2:
-        flat = torch.nn.functional.pad(flat, (0, 1))
     if flat.stride() != (flat.shape[1], 1):
         # Viewing another dtype needs more than `contiguous`: the strides must be exact even for a single
         # splat.
         flat = flat.clone(memory_format=torch.contiguous_format)
     return flat.view(torch.int32)
-
-
-def as_column(words: Tensor, like: Tensor) -> Tensor:
-    """Undo `words_of`: int32 [R, words] as [R, ...] with the dtype and splat shape of `like`."""
-    values = words.view(like.dtype)[:, : math.prod(like.shape[1:])]
-    return values.reshape(-1, *like.shape[1:])
 
 
 def tile_costs(sums: Tensor, first: int, views: int, grain: int) -> list[Tensor]:
@@ -99,12 +90,8 @@ def tile_costs(sums: Tensor, first: int, views: int, grain: int) -> list[Tensor]
 
     Returns:
         For each view float16 [ceil(T / grain)], at most 65504, in memory of its own.
-
-    Raises:
-        RuntimeError: wrong shapes, dtypes or numbers.
     """
-    costs: list[Tensor] = torch.ops.blitzgs.tile_costs(sums, first, views, grain)
-    return costs
+    return torch.ops.blitzgs.tile_costs(sums, first, views, grain)
 
 
 def divide_tiles(
@@ -126,8 +113,5 @@ def divide_tiles(
     Returns:
         M + 1 ascending bounds, 0 and B T included; each is the one nearest to its share of the total, the
         later one of two.
-
-    Raises:
-        RuntimeError: wrong shapes, dtypes or numbers.
     """
     return tuple(torch.ops.blitzgs.divide_tiles(costs, similar, tiles, grain, tile_cost, parts))

@@ -44,15 +44,8 @@ def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor
 def colors_of_views(degree: int, means: Tensor, viewmats: Tensor, coeffs: Tensor, per_view: bool) -> Tensor:
     """Return ``max(SH(direction) + 0.5, 0)`` of every Gaussian in every view (docs/image.md, section 4).
 
-    Args:
-        degree: as for `spherical_harmonics`; `coeffs` has enough coefficients for it.
-        means: [..., N, 3].
-        viewmats: [..., C, 4, 4].
-        coeffs: [..., N, K, D], or [..., C, N, K, D] if `per_view`.
-        per_view: whether each view has its own coefficients.
-
-    Returns:
-        [..., C, N, D]; of a mean or a view that is not finite, any finite value.
+    `coeffs`: [..., N, K, D], or [..., C, N, K, D] if `per_view`, with enough coefficients for the degree.
+    Returns [..., C, N, D]; of a mean or a view that is not finite, any finite value.
     """
     rotations, translations = viewmats[..., :3, :3], viewmats[..., :3, 3:]
     centres = -(rotations.mT @ translations).mT

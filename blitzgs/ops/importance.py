@@ -11,51 +11,10 @@ from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 
-# Units of a weight in 1, kContributionScale of csrc/importance/importance.h.
+# Units of a weight in 1, kContributionScale of csrc/importance/importance.h. The op `contributions` returns
+# sums of such integers, so that they do not depend on the order of addition, and the sums of disjoint ranges
+# of tiles add up to the sum of all tiles.
 UNITS = 1 << 32
-
-
-def splat_contributions(
-    means2d: Tensor,
-    conics: Tensor,
-    splat_opacities: Tensor,
-    isect_splats: Tensor,
-    tile_offsets: Tensor,
-    *,
-    n_cameras: int,
-    width: int,
-    height: int,
-    tile_size: int = 16,
-    tile_begin: int = 0,
-    tile_end: int = -1,
-    n_splats: Tensor | None = None,
-    squares: bool = False,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Sum alpha T over the pixels at which each splat is composited, and count these pixels.
-
-    Alpha and T have the same bits as in `blitzgs.ops.rasterize.rasterize`. The sums are integers, so
-    they do not depend on the order of addition, and the sums of disjoint tile ranges add up to the sum of all
-    tiles.
-
-    Args: those of `blitzgs.ops.rasterize.rasterize` (tiles of 16 px on CUDA), and
-        n_splats: int64 [1] on the device of the splats: only the first `n_splats` splats are valid. None:
-            all.
-        squares: sum (alpha T)^2 too.
-
-    Returns:
-        Weights int64 [P], in units of 2^-32 (each alpha T rounded to the nearest); pixels int32 [P]; and the
-        sums of the squares int64 [P], in the same units (each square rounded down), or [0] if not asked for.
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes, a tile range outside the images, or a tile size that CUDA lacks.
-    """
-    sums: tuple[Tensor, Tensor, Tensor] = torch.ops.blitzgs.contributions(
-        means2d, conics, splat_opacities, isect_splats, tile_offsets,
-        n_cameras, width, height, tile_size, tile_begin, tile_end, n_splats, squares,
-    )  # fmt: skip
-    return sums
-
-
 # How many times a weight is divided by the square root of its number of pixels, for each score rule.
 DIVISIONS = {"weight": 0, "root": 1, "density": 2}
 
@@ -99,9 +58,6 @@ def view_sums_(
         rule: score rule, a key of `DIVISIONS`.
         eps: added to the number of pixels.
         unit: unit of the score; division by a power of two is exact.
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes, too many views, or a column outside the matrix.
     """
     torch.ops.blitzgs.view_sums_(
         list(sums), list(splats), weights, pixels, counts, list(columns), DIVISIONS[rule], eps, unit
@@ -145,7 +101,7 @@ def pixel_splats(
             order.
 
     Raises:
-        RuntimeError: wrong shapes or dtypes, or a tile size that CUDA lacks.
+        RuntimeError: a tile size that CUDA lacks.
     """
     slots, rows, n_rows = None, None, n_cameras * height * width
     if pixels is not None:
@@ -197,10 +153,7 @@ class MassCut(NamedTuple):
         )
 
     def take_steps(self, share: tuple[int, int], first: int, last: int) -> None:
-        """Run the steps `first` to `last` - 1; `share` is a numerator and a denominator of at most 10^9.
-
-        RuntimeError: wrong shapes, dtypes or numbers.
-        """
+        """Run the steps `first` to `last` - 1; `share` is a numerator and a denominator of at most 10^9."""
         torch.ops.blitzgs.mass_cut_(
             *self.items, self.searches, self.sums, self.listed, self.chosen, *share, first, last
         )

@@ -21,6 +21,11 @@ class TileGrid(NamedTuple):
     tile_begin: int = 0  # the range of tiles to composite
     tile_end: int = -1  # -1: all tiles
 
+    @property
+    def tiles(self) -> tuple[int, int]:
+        """(tiles_x, tiles_y), the tiles that cover a view."""
+        return tile_counts(self.width, self.height, self.tile_size)
+
 
 def tile_counts(width: int, height: int, tile_size: int) -> tuple[int, int]:
     """Return (tiles_x, tiles_y), the tiles that cover an image of width x height pixels."""
@@ -91,5 +96,4 @@ def intersect(
     """
     splats = (means2d, conics, splat_opacities, depths, camera_ids, ids)
     grid = TileGrid(n_cameras, width, height, tile_size, tile_begin, tile_end)
-    lists: tuple[Tensor, Tensor] = torch.ops.blitzgs.intersect(*splats, *grid, n_isects, n_splats)
-    return lists
+    return torch.ops.blitzgs.intersect(*splats, *grid, n_isects, n_splats)

@@ -132,7 +132,7 @@ class GrowingSchedule(AdamTables):
 
     def is_full(self) -> bool:
         """Tell whether no further step fits."""
-        return self.last - self.begin >= self.LENGTH
+        return self.row >= self.LENGTH
 
     def step_(
         self,
@@ -183,9 +183,6 @@ def lazy_adam_step_(
         step: 1 <= step <= S.
         grads: gradients of the listed rows, shaped like the parameters with U rows.
         ids: int32 or int64 [U], the rows, each once; None: all.
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
     with below_autograd():
         torch.ops.blitzgs.lazy_adam_step_(
@@ -208,9 +205,6 @@ def lazy_adam_catch_up_(
         step: 0 <= step <= S; 0: nothing to do.
         ids: int32 or int64 [A], the rows, each once; None: all.
         count: int32 [1], only the first `count` of `ids` are rows; the host does not wait for it. None: all.
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
     with below_autograd():
         torch.ops.blitzgs.lazy_adam_catch_up_(
@@ -302,9 +296,6 @@ def project_bwd_step_(
         options: the options of the projection; scales and opacities are taken before their activation.
         level: uint8 [N], octree levels, if opacities fade with them (`options.fade`).
         means2d_sums: [P, 2], receives the gradient of `splats.means2d` if `gradients` has a part per rank.
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes, or a step outside the table.
     """
     with below_autograd():
         torch.ops.blitzgs.project_bwd_step_(

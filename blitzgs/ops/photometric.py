@@ -29,14 +29,10 @@ def photometric_loss(
 
     Returns:
         [B], dtype of `renders`.
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes.
     """
     l1, ssim_sums = photometric_sums(renders, targets, masks)
     counts = pixel_counts(renders, masks)
-    loss = ((1 - ssim_weight) * l1 + ssim_weight * (counts - ssim_sums)) / counts.clamp_min(1)
-    return loss
+    return ((1 - ssim_weight) * l1 + ssim_weight * (counts - ssim_sums)) / counts.clamp_min(1)
 
 
 def ssim(renders: Tensor, targets: Tensor, masks: Tensor | None = None) -> Tensor:
@@ -118,16 +114,12 @@ def photometric_fwd_bwd(
         (sums float64 [B, K, 2] in K parts, v_renders [B, H, W, 3], undefined beyond the owned pixels,
         ``scale_weight / max(visible, 1)`` [B], ``opacity_weight / (B max(visible, 1))`` [B]; the last two
         are [0] without `visible`, and zeros if the images have no pixels).
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes.
     """
     with below_autograd():
-        found: tuple[Tensor, Tensor, Tensor, Tensor] = torch.ops.blitzgs.photometric_fwd_bwd(
+        return torch.ops.blitzgs.photometric_fwd_bwd(
             renders, targets, _as_bytes(masks), l1_weights, ssim_weights, tile_size, tile_begin, tile_end,
             samples, visible, scale_weight, opacity_weight,
         )  # fmt: skip
-    return found
 
 
 def _as_bytes(masks: Tensor | None) -> Tensor | None:
@@ -162,7 +154,7 @@ def report_(
     n_ranks: int,
     targets: Sequence[Tensor],
 ) -> None:
-    """Write this rank's part of the report into all targets (RuntimeError: wrong shapes or dtypes).
+    """Write this rank's part of the report into all targets.
 
     A target has the loss sums of the M ranks, [M, 2, B], and then the work of the T tiles.
 

@@ -45,9 +45,6 @@ def density_stats_(
         weight: factor from the gradient of the step's loss to the gradient of one view's loss: B when the
             step's loss is a mean over B views.
         phi: [N], factor of each Gaussian's gradient; None = 1.
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes.
     """
     with below_autograd():
         statistics = grad_sum, grad_count, max_radii
@@ -84,9 +81,6 @@ def position_noise_(
         step: optimiser step; each step draws other numbers.
         threshold: opacity at which the noise falls to a half, in [0, 1].
         strength: inverse length in the unit of the means.
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes.
     """
     with below_autograd():
         torch.ops.blitzgs.position_noise_(
@@ -108,17 +102,15 @@ def overlap(opacities: Tensor, copies: Tensor) -> Tensor:
         opacities: o, float64 [M]; the sum alternates, and its terms exceed it by up to 10^5.
         copies: N, int64 [M], 1 to `MAX_COPIES`.
     """
-    overlaps: Tensor = torch.ops.blitzgs.overlap(opacities, copies)
-    return overlaps
+    return torch.ops.blitzgs.overlap(opacities, copies)
 
 
 def draw_weights(opacities: Tensor, causes: Tensor) -> Tensor:
     """Return opacities as weights of a draw, int64 [N], in units of 2^-31; 0 for rows with a cause of death.
 
-    `opacities`: float32 [N], logits. `causes`: uint8 [N]. RuntimeError: wrong shapes or dtypes.
+    `opacities`: float32 [N], logits. `causes`: uint8 [N].
     """
-    weights: Tensor = torch.ops.blitzgs.draw_weights(opacities, causes)
-    return weights
+    return torch.ops.blitzgs.draw_weights(opacities, causes)
 
 
 def residual_draws(
@@ -133,17 +125,13 @@ def residual_draws(
         weights: w, int64 [N], 0 to 2^31.
         ids: int64 [N], persistent.
         draws: below 2^31.
-        total: sum of the weights of all ranks.
+        total: sum of the weights of all ranks, positive.
         event: number that differs between draws.
 
     Returns:
         Whole draws, int64 [N], and keys, float32 [N].
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes, or `total` is not positive.
     """
-    whole, keys = torch.ops.blitzgs.residual_draws(weights, ids, draws, total, seed, event)
-    return whole, keys
+    return torch.ops.blitzgs.residual_draws(weights, ids, draws, total, seed, event)
 
 
 def share_rows_(
@@ -162,9 +150,6 @@ def share_rows_(
         rows: int64 [M], each at most once; not checked.
         copies: int64 [M], 1 to `MAX_COPIES`; the row itself is one.
         least: sharing does not reduce a logit below this.
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes.
     """
     torch.ops.blitzgs.share_rows_(opacities, scales, list(moments), rows, copies, least)
 
@@ -184,9 +169,6 @@ def tree_sums(features: Tensor, roots: Tensor, nodes: Tensor, leaves: Tensor, de
 
     Returns:
         int64 [M], the same bits on every device.
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes.
     """
     return torch.ops.blitzgs.tree_sums(features, roots, nodes, leaves, depth)
 

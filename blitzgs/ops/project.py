@@ -75,7 +75,7 @@ class _Saved(NamedTuple):
     @classmethod
     def of(cls, ctx: Any) -> _Saved:
         """Read them. Call this once: checkpointing recomputes saved tensors at each reading."""
-        *tensors, viewmats, Ks, camera_ids, visible_ids, splat_offsets, level, ids = ctx.saved_tensors  # noqa: N806
+        *tensors, viewmats, Ks, camera_ids, visible_ids, splat_offsets, level, ids = ctx.saved_tensors
         return cls(tensors, (viewmats, Ks), (camera_ids, visible_ids, splat_offsets), level, ids)
 
 
@@ -84,11 +84,8 @@ def _gradients(
 ) -> Sequence[Tensor | None]:
     """Return the gradients of viewmats and of all gaussians, or of the tables, if they are needed.
 
-    Args:
-        needed: which of means, quats, scales, opacities and the given parts of SH need a gradient.
-        need_viewmats: whether viewmats need a gradient.
-        sparse: which of these gradients are to be sparse.
-        v: gradients of the splats; None: zero.
+    `needed`: which of means, quats, scales, opacities and the given parts of SH need a gradient; `sparse`:
+    which of these are to be sparse. `v`: gradients of the splats; None: zero.
     """
     saved = _Saved.of(ctx)
 
@@ -176,16 +173,13 @@ class _Project(torch.autograd.Function):
 
 
 def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-    gaussians, viewmats, Ks, *others = inputs  # noqa: N806
+    gaussians, viewmats, Ks, *others = inputs
     options = ProjectionOptions(*others[6 : 6 + N_OPTIONS])
     # To torch an empty list of numbers is one of tensors, which has an empty list of gradients.
     ctx.no_gradients = [[] if isinstance(x, (list, tuple)) and not x else None for x in (Ks, *others)]
     *columns, _, _ = output
-    _save(
-        ctx,
-        ProjectionInputs(gaussians, (viewmats, Ks), options, level=others[5]),
-        ProjectedSplats._make((*columns, None)),
-    )
+    inputs = ProjectionInputs(gaussians, (viewmats, Ks), options, level=others[5])
+    _save(ctx, inputs, ProjectedSplats._make((*columns, None)))
 
 
 def _backward(ctx: Any, *v_output: Tensor | None) -> Any:
@@ -266,14 +260,11 @@ def project(
     """
     if active_views is not None and active_ids is None:
         active_ids = torch.arange(len(means), dtype=torch.int32, device=means.device)
-    inputs = ProjectionInputs(
-        gaussian_tensors(means, quats, scales, opacities, sh),
-        (viewmats, Ks),
-        ProjectionOptions(
-            width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw
-        ),
-        [tensor for tensor in (active_ids, active_views) if tensor is not None],
+    options = ProjectionOptions(
+        width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw
     )
+    gaussians = gaussian_tensors(means, quats, scales, opacities, sh)
+    inputs = ProjectionInputs(gaussians, (viewmats, Ks), options, (active_ids, active_views))
     return differentiable_splats(inputs, sparse_grad)
 
 
@@ -302,7 +293,7 @@ def differentiable_splats(
     `sparse_grad`: see `project`. `splats`: the result of `project_splats` for these inputs, if it is already
     known. `rows`: the visible rows of these inputs, if `splats` got their colours from them.
     """
-    viewmats, Ks = inputs.cameras  # noqa: N806
+    viewmats, Ks = inputs.cameras
     if not torch.compiler.is_compiling():
         splats = project_splats(inputs) if splats is None else splats
         tables = inputs.gaussians if rows is None else [*inputs.gaussians, *rows.sh]

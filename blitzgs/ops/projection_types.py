@@ -85,8 +85,7 @@ def first_rows(columns: Sequence[Tensor], lengths: Sequence[int]) -> list[Tensor
     Autograd does not see that these are views: a Function may return views, but its caller could not change
     them in place.
     """
-    found: list[Tensor] = torch.ops.blitzgs.first_rows(columns, lengths)
-    return found
+    return torch.ops.blitzgs.first_rows(columns, lengths)
 
 
 class Splats(NamedTuple):
@@ -135,9 +134,6 @@ class WeightedViews(NamedTuple):
     opacity_reg: Tensor | None = None
 
 
-_ALL_ROWS = (None, None, None, None)
-
-
 class ProjectionInputs(NamedTuple):
     """The inputs of a projection."""
 
@@ -160,7 +156,7 @@ class ProjectionInputs(NamedTuple):
     @property
     def active_arguments(self) -> Sequence[Tensor | None]:
         """The four arguments of the op that tell which Gaussians to consider."""
-        return (*self.active, *_ALL_ROWS[len(self.active) :])
+        return (*self.active, *[None] * 4)[:4]
 
     def project(
         self, capacity: Sizes | None, rank_tiles: Sequence[tuple[int, int]] = ()

@@ -10,12 +10,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs._library import without_autograd
+from blitzgs._library import below_autograd
 from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.intersect import TileGrid, pixels_of_tiles
 from blitzgs.ops.splat_gradients import GradientBuffer, gradient_columns
 
-rasterize_fwd = without_autograd(torch.ops.blitzgs.rasterize_fwd)
 # For alphas = 1 - transmittances. With the number 1, torch would first make a tensor of it, which takes 5 us
 # of the host's time. A tensor without dimensions on the CPU combines with tensors of any device and dtype.
 _ONE = torch.ones((), device="cpu")
@@ -187,16 +186,14 @@ def _gradients(
         if v_image is None:
             v_image = transmittances.new_zeros(*transmittances.shape, colors.shape[1])
         deterministic = torch.are_deterministic_algorithms_enabled()
-        v_abs = v_backgrounds = None
-        v_splats: Sequence[Tensor]
+        table = v_backgrounds = None
         if may_be_table and colors.is_cuda and colors.shape[1] == 3 and v_alphas is None and not absgrad:
             table = ctx.gradients.take(means2d)
-            torch.ops.blitzgs.rasterize_bwd(*saved, v_image, None, *ctx.grid, False, deterministic, table)
+        *v_splats, v_abs = torch.ops.blitzgs.rasterize_bwd(
+            *saved, v_image, v_alphas, *ctx.grid, absgrad, deterministic, table
+        )
+        if table is not None:
             v_splats = gradient_columns(table)
-        else:
-            *v_splats, v_abs = torch.ops.blitzgs.rasterize_bwd(
-                *saved, v_image, v_alphas, *ctx.grid, absgrad, deterministic
-            )
         if ctx.needs_input_grad[4]:
             # A matrix product would be of less precision under autocast.
             v_backgrounds = (v_image * transmittances[..., None]).sum(dim=(1, 2))
@@ -226,7 +223,10 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor]:
         *_, call = arguments
         if call.composited is None:
-            output = rasterize_fwd(*call.splats, *call.grid, True, call.backward_follows)
+            with below_autograd():  # not the formula below: its Python takes 20 us of the host's time
+                output = torch.ops.blitzgs.rasterize_fwd(
+                    *call.splats, *call.grid, True, call.backward_follows
+                )
             alphas = _ONE - output[1]
         else:
             *output, alphas = call.composited

@@ -30,9 +30,6 @@ def take_rows(
 
     Returns:
         [M, ...] of each column.
-
-    Raises:
-        RuntimeError: shapes or dtypes do not fit.
     """
     if out is None:
         out = [column.new_empty((len(rows), *column.shape[1:])) for column in columns]
@@ -41,7 +38,7 @@ def take_rows(
 
 
 def put_rows_(columns: Sequence[Tensor], rows: Tensor, fresh: Sequence[Tensor] = ()) -> None:
-    """Overwrite rows of columns, in place (RuntimeError: shapes or dtypes do not fit).
+    """Overwrite rows of columns, in place.
 
     `columns`: [N, ...], any dtypes, contiguous. `rows`: int64 [M], from 0 to N - 1, each at most once; not
     checked. `fresh`: what the rows become, [M, ...], of the dtype and row shape of each column; none: zeros.
@@ -67,13 +64,10 @@ def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
 def full_gradients(
     ids: Tensor, gradients: Sequence[Tensor | None], shapes: Sequence[torch.Size], sparse: Sequence[bool]
 ) -> list[Tensor | None]:
-    """Return the gradients of whole parameters from those of their rows `ids`, as sparse or dense tensors.
+    """Return the gradients of whole parameters from those of their rows, as sparse or dense tensors.
 
-    Args:
-        ids: int32 or int64 [U], ascending, each once.
-        gradients: [U, ...] of each parameter; None: it needs none.
-        shapes: [N, ...], of each parameter.
-        sparse: which of the results are sparse.
+    `ids`: int32 or int64 [U], ascending, each once. `gradients`: [U, ...] of each parameter; None: it needs
+    none. `shapes`: [N, ...] of each. `sparse`: which of the results are sparse.
     """
     ids = ids.long()
     return [

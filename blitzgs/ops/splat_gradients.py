@@ -77,17 +77,15 @@ class SplatGradients(NamedTuple):
     def sum_returned(
         self, values: Tensor, places: Tensor, group_sizes: Sequence[int], splats: int
     ) -> SplatGradients:
-        """Return the gradients of a rank's own splats, summed over the ranks that composited them.
+        """Return the gradients of a rank's own splats, summed over the ranks in their order.
 
-        Args:
-            values: [sum(group_sizes), F], the rows of each rank's `side_by_side` for this rank's splats.
-            places: from `blitzgs.ops.exchange.scatter_splats`.
-            group_sizes: number of splats that this rank sent to each rank.
-            splats: number P of this rank's own splats.
+        `values`: [sum(group_sizes), F], the rows of each rank's `side_by_side` for this rank's splats.
+        `places` and `group_sizes`: from and for `blitzgs.ops.exchange.scatter_splats`. `splats`: P. The
+        gradients of splats that went nowhere are zero.
         """
         columns = self._columns()
         widths = [math.prod(column.shape[1:]) for column in columns]
-        sums = sum_splats(values, places, group_sizes, splats, widths)
+        sums = torch.ops.blitzgs.sum_splats(values, places, list(group_sizes), splats, widths)
         return SplatGradients(
             [total.reshape(-1, *like.shape[1:]) for total, like in zip(sums, columns, strict=True)]
         )
@@ -95,28 +93,6 @@ class SplatGradients(NamedTuple):
     def _columns(self) -> Sequence[Tensor]:
         """Return the four columns."""
         return gradient_columns(self.parts[0]) if len(self.parts) == 1 else self.parts
-
-
-def sum_splats(
-    values: Tensor, places: Tensor, group_sizes: Sequence[int], splats: int, widths: Sequence[int]
-) -> list[Tensor]:
-    """Sum, for each splat, the values that the ranks returned for it, in the order of the ranks.
-
-    Args:
-        values: [sum(group_sizes), F], float32 (CPU also float64), in the order in which `scatter_splats`
-            packed them.
-        places: from `blitzgs.ops.exchange.scatter_splats`.
-        group_sizes: as for `scatter_splats`.
-        splats: P.
-        widths: widths of the columns that the F values consist of; they add up to F.
-
-    Returns:
-        [P, width] each; zero for splats that went nowhere. Deterministic.
-
-    Raises:
-        RuntimeError: wrong shapes or dtypes.
-    """
-    return torch.ops.blitzgs.sum_splats(values, places, list(group_sizes), splats, list(widths))
 
 
 @dataclass

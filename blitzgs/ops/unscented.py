@@ -89,7 +89,7 @@ def project_unscented(inputs: ProjectionInputs, lenses: Lenses) -> ProjectedSpla
 
 
 def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-    gaussians, viewmats, Ks, lenses, viewmats_rs, *options, _, camera_ids, offsets = inputs  # noqa: N806
+    gaussians, viewmats, Ks, lenses, viewmats_rs, *options, _, camera_ids, offsets = inputs
     ctx.save_for_backward(*gaussians, viewmats, Ks, lenses, viewmats_rs, camera_ids, offsets)
     ctx.options = options
     # To torch an empty list of numbers is one of tensors; `transform` is none.
@@ -98,7 +98,7 @@ def _setup_context(ctx: Any, inputs: Any, output: Any) -> None:
 
 
 def _backward(ctx: Any, *v_output: Tensor) -> Any:
-    *gaussians, viewmats, Ks, lenses, viewmats_rs, camera_ids, offsets = ctx.saved_tensors  # noqa: N806
+    *gaussians, viewmats, Ks, lenses, viewmats_rs, camera_ids, offsets = ctx.saved_tensors
     v_splats = v_output[: len(gaussians)]
 
     def compute() -> Sequence[Tensor]:

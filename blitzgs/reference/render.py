@@ -77,28 +77,17 @@ def _weights(
     means2d: Tensor, conics: Tensor, opacities: Tensor, width: int, height: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Return alpha before clipping, alpha, T before and after it, and alpha T where composited, [M, H W]."""
-    alphas, unclipped = _alphas(means2d, conics, opacities, width, height)
-    touched = alphas >= ALPHA_CUT
-    alphas = torch.where(touched, alphas, torch.zeros_like(alphas))
+    columns, rows = (torch.arange(size).to(means2d) + 0.5 for size in (width, height))
+    dx, dy = columns.repeat(height) - means2d[:, :1], rows.repeat_interleave(width) - means2d[:, 1:]
+    a, b, c = conics[:, :, None].unbind(dim=1)
+    unclipped = opacities[:, None] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+    touched = unclipped >= ALPHA_CUT
+    alphas = torch.where(touched, unclipped.clamp(max=ALPHA_MAX), torch.zeros_like(unclipped))
     after = torch.cumprod(1 - alphas, dim=0)  # never increasing
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
     composited = touched & (after >= MIN_TRANSMITTANCE)
     weights = torch.where(composited, alphas * before, torch.zeros_like(alphas))
     return unclipped, alphas, before, after, weights
-
-
-def _alphas(
-    means2d: Tensor, conics: Tensor, opacities: Tensor, width: int, height: int
-) -> tuple[Tensor, Tensor]:
-    """Return alpha [M, H W] clipped at 0.99 and before clipping."""
-    columns = torch.arange(width, dtype=means2d.dtype, device=means2d.device) + 0.5
-    rows = torch.arange(height, dtype=means2d.dtype, device=means2d.device) + 0.5
-    y, x = torch.meshgrid(rows, columns, indexing="ij")
-    dx = x.reshape(1, -1) - means2d[:, :1]
-    dy = y.reshape(1, -1) - means2d[:, 1:]
-    a, b, c = conics[:, :, None].unbind(dim=1)
-    unclipped = opacities[:, None] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
-    return unclipped.clamp(max=ALPHA_MAX), unclipped
 
 
 def _cut(unclipped: Tensor, after: Tensor, before: Tensor, depths: Tensor, tolerance: float) -> Tensor:
@@ -242,12 +231,8 @@ def contributions(
     """Compute what activated Gaussians contribute to views; arguments as for `blitzgs.contributions`."""
     view: dict[str, Any] = dict(width=width, height=height, near_plane=near_plane, far_plane=far_plane)
     shape = (len(viewmats), len(means))
-    result = Contributions(
-        torch.zeros(shape, dtype=torch.float64),
-        torch.zeros(shape, dtype=torch.int64),
-        torch.zeros(shape, dtype=torch.bool),
-        torch.zeros(shape, dtype=torch.int64),
-    )
+    dtypes = (torch.float64, torch.int64, torch.bool, torch.int64)
+    result = Contributions(*(torch.zeros(shape, dtype=dtype) for dtype in dtypes))
     for v, camera in enumerate(zip(viewmats, Ks, strict=True)):
         tensors: Any = (tensor.double() for tensor in (means, quats, scales, opacities, means, *camera))
         splats = project_splats(*tensors, **view, sh_degree=None, eps2d=eps2d, antialiased=antialiased)

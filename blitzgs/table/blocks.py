@@ -124,14 +124,11 @@ class BlockIndex:
         """Return the rows that the views may see, and for each row the views that may see it.
 
         Whether a row is in the result depends on that row alone, not on the order of the rows or on their
-        division among ranks. Arguments as in `blitzgs.ops.blocks.cull_blocks`; `limits` are its near_plane,
-        far_plane and eps2d.
+        division among ranks. Arguments as in `blitzgs.ops.blocks.cull_blocks`.
         """
+        rows = (self.bounds, table["means"], table["scales"])
         pending = self._pending(table)
-        return cull_blocks(
-            self.bounds, table["means"], table["scales"], views.viewmats, views.Ks, views.width, views.height,
-            *limits, pending, self.level_ranges, rules, capacity_blocks,
-        )  # fmt: skip
+        return cull_blocks(*rows, views, limits, pending, self.level_ranges, rules, capacity_blocks)
 
     def update(self, table: GaussianTable, ids: Tensor | None) -> None:
         """Recompute the bounds after an optimiser step of the rows `ids` (int32 [U]; None: of any rows).

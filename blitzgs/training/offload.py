@@ -12,7 +12,7 @@ from torch import Tensor
 
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.frame.render import Frame, RenderOptions, ViewFilter
-from blitzgs.frame.transport import stage_ended
+from blitzgs.frame.transport.protocol import stage_ended
 from blitzgs.ops.host import to_device
 from blitzgs.ops.projection_types import MAX_VIEWS
 from blitzgs.table.blocks import Cameras

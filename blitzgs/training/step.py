@@ -11,7 +11,8 @@ from torch import Tensor
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.frame.render import Frame, RenderOptions, ViewFilter, backward_splats, render_frame
 from blitzgs.frame.tiles import TileAssignment
-from blitzgs.frame.transport import open_transport, stage_ended
+from blitzgs.frame.transport import open_transport
+from blitzgs.frame.transport.protocol import stage_ended
 from blitzgs.ops.blocks import ActiveRows, gate_views_
 from blitzgs.ops.projection_types import Sizes
 from blitzgs.table.blocks import BlockIndex

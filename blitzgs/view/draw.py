@@ -17,7 +17,7 @@ from torch import Tensor
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.render import Frame, RenderOptions, render_frame
 from blitzgs.frame.tiles import TileAssignment, collect_images
-from blitzgs.frame.transport import LocalTransport
+from blitzgs.frame.transport.protocol import LocalTransport
 from blitzgs.ops.blocks import BLOCK_ROWS, ActiveRows
 from blitzgs.ops.host import to_host
 from blitzgs.ops.projection_types import Sizes, Views

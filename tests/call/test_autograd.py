@@ -10,11 +10,11 @@ import torch.utils.checkpoint
 from torch._dynamo.testing import CompileCounterWithBackend
 
 import blitzgs
-from blitzgs.call.bad_values import _warn_of_gradient
+from blitzgs.call.arguments import warn_of_gradient
 from blitzgs.ops.photometric import photometric_loss
 from blitzgs.reference.projection import covariance_factors
 from tests.call.test_raw_rasterization import raw, raw_parameters
-from tests.helpers import DEVICES, PARAMETERS, random_scene, rasterize_scene, refused, relative_error
+from tests.helpers import DEVICES, PARAMETERS, agree, random_scene, rasterize_scene, refused
 
 
 def render_raw(scene):
@@ -119,10 +119,8 @@ def test_images_may_be_changed_in_place(device, options):
         else:
             renders, alphas = renders * mask[..., None], alphas * mask[..., None]
         (renders.square().sum() + alphas.square().sum()).backward()
-        gradients.append([getattr(leaves, name).grad for name in PARAMETERS])
-    for name, actual, expected in zip(PARAMETERS, *gradients, strict=True):
-        assert (actual is None) == (expected is None)
-        assert actual is None or relative_error(actual, expected) < 1e-5, name
+        gradients.append(leaves.gradients())
+    agree(*gradients, 1e-5)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -139,16 +137,11 @@ def test_sparse_gradients_are_the_dense_ones(device, options, with_sh):
     sparse_names = ["means", "quats", "scales"]
     if with_sh and "render_mode" not in options:
         sparse_names += ["opacities", "colors"]
-    for name in PARAMETERS:
-        expected, actual = getattr(dense, name).grad, getattr(sparse, name).grad
-        assert (actual is None) == (expected is None)
-        if actual is None:
-            continue
-        assert actual.is_sparse == (name in sparse_names), name
-        if actual.is_sparse:
-            assert actual.coalesce().values().shape[0] < 80
-            actual = actual.to_dense()
-        assert relative_error(actual, expected) < 1e-6, name
+    found = sparse.gradients()
+    for name, gradient in zip(PARAMETERS, found, strict=True):
+        assert gradient is None or gradient.is_sparse == (name in sparse_names), name
+        assert name not in sparse_names or gradient.coalesce().values().shape[0] < 80
+    agree([None if g is None else g.to_dense() for g in found], dense.gradients(), 1e-6)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -166,8 +159,7 @@ def test_sparse_gradients_pass_what_was_made_of_opacities_and_colours(device):
         inputs = [*(getattr(leaves, name) for name in names), logits, dc, rest]
         assert [x.grad.is_sparse for x in inputs] == [sparse] * 3 + [False] * 3
         results.append([x.grad.to_dense() for x in inputs])
-    for actual, expected in zip(*results, strict=True):
-        assert relative_error(actual, expected) < 1e-5
+    agree(*results, 1e-5)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -181,14 +173,13 @@ def test_an_argument_may_have_the_negative_bit(device, name):
         if with_bit:
             called = replace(leaves, **{name: torch._neg_view(-getattr(leaves, name))})
         rasterize_scene(called)[0].square().sum().backward()
-        results.append([getattr(leaves, parameter).grad for parameter in PARAMETERS])
-    for parameter, expected, actual in zip(PARAMETERS, *results, strict=True):
-        assert relative_error(actual, expected) < 1e-5, parameter
+        results.append(leaves.gradients())
+    agree(*results, 1e-5)
 
 
 @pytest.mark.parametrize("render", [rasterize_scene, render_raw], ids=["rasterization", "raw_rasterization"])
 def test_intrinsics_that_require_a_gradient_are_named_once(render, recwarn):
-    _warn_of_gradient.cache_clear()
+    warn_of_gradient.cache_clear()
     scene = random_scene(n=20)
     for tensor in (scene.means, scene.Ks):
         tensor.requires_grad_()
@@ -212,9 +203,8 @@ def test_autocast_changes_nothing(device):
         with torch.autocast(device, dtype=torch.bfloat16, enabled=enabled):
             renders, _, _ = rasterize_scene(leaves, backgrounds=backgrounds)
             renders.square().sum().backward()
-        results.append([renders.detach(), backgrounds.grad, *(getattr(leaves, n).grad for n in PARAMETERS)])
-    for expected, actual in zip(*results, strict=True):
-        assert relative_error(actual, expected) < 1e-5
+        results.append([renders.detach(), backgrounds.grad, *leaves.gradients()])
+    agree(*results, 1e-5)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -225,16 +215,14 @@ def test_checkpointing_recomputes_the_call(device, options):
     for call in (lambda f, *a: f(*a), partial(torch.utils.checkpoint.checkpoint, use_reentrant=False)):
         for _ in range(3):  # on CUDA the capacity is estimated from earlier calls
             leaves = scene.leaves()
-            inputs = [getattr(leaves, name) for name in PARAMETERS]
 
             def image(*values):
                 changed = replace(scene, **dict(zip(PARAMETERS, values, strict=True)))
                 return rasterize_scene(changed, **options)[0]
 
-            call(image, *inputs).square().sum().backward()
-        results.append([x.grad for x in inputs])
-    for name, actual, expected in zip(PARAMETERS, *results, strict=True):
-        assert relative_error(actual, expected) < 1e-5, name
+            call(image, *leaves.parameters()).square().sum().backward()
+        results.append(leaves.gradients())
+    agree(*results, 1e-5)
 
 
 COMPILED = [{}, {"packed": False, "render_mode": "RGB+ED", "rasterize_mode": "antialiased"}]
@@ -251,8 +239,7 @@ def test_one_graph_is_compiled_of_a_call(device, options):
         return renders, alphas, meta["means2d"], meta["radii"], meta["flatten_ids"]
 
     def gradients(leaves, renders, alphas):
-        loss = renders.square().sum() + alphas.sum()
-        return torch.autograd.grad(loss, [getattr(leaves, name) for name in PARAMETERS])
+        return torch.autograd.grad(renders.square().sum() + alphas.sum(), leaves.parameters())
 
     leaves = scene.leaves()
     eager = call(leaves)
@@ -262,9 +249,7 @@ def test_one_graph_is_compiled_of_a_call(device, options):
     renders = compiled[0]
     renders[:, :4] = 0  # may be changed in place here too
     eager[0][:, :4] = 0
-    pairs = zip(gradients(leaves, *compiled[:2]), gradients(leaves, *eager[:2]), strict=True)
-    for name, (actual, expected) in zip(PARAMETERS, pairs, strict=True):
-        assert relative_error(actual, expected) < 1e-5, name
+    agree(gradients(leaves, *compiled[:2]), gradients(leaves, *eager[:2]), 1e-5)
     with pytest.raises(RuntimeError, match="create_graph=False|double backward"):  # first derivatives alone
         (gradient,) = torch.autograd.grad(graph(leaves)[0].sum(), leaves.means, create_graph=True)
         gradient.sum().backward()
@@ -281,10 +266,7 @@ def test_one_graph_takes_other_numbers_of_gaussians_views_and_pixels(packed):
         leaves = random_scene(n=n, cameras=cameras, width=width, height=height).leaves()
         image, expected = image_of(leaves), rasterize_scene(leaves, packed=packed)[0]
         assert torch.equal(image, expected)
-        inputs = [getattr(leaves, name) for name in PARAMETERS]
-        found = torch.autograd.grad(image.square().sum(), inputs)
-        for actual, wanted in zip(found, torch.autograd.grad(expected.square().sum(), inputs), strict=True):
-            assert relative_error(actual, wanted) < 1e-5
+        agree(*(torch.autograd.grad(x.square().sum(), leaves.parameters()) for x in (image, expected)), 1e-5)
         graphs.add(counter.frame_count)  # forward and backward
     assert graphs == {2}
 
@@ -299,8 +281,7 @@ def test_a_graph_of_many_views_and_one_of_covariances():
         image = torch.compile(lambda s, call=call: call(s)[0], fullgraph=True, backend="aot_eager")(scene)
         expected = call(scene)[0]
         assert torch.equal(image, expected)
-        found, wanted = (torch.autograd.grad(x.square().sum(), scene.means)[0] for x in (image, expected))
-        assert relative_error(found, wanted) < 1e-5
+        agree(*(torch.autograd.grad(x.square().sum(), scene.means) for x in (image, expected)), 1e-5)
 
 
 def test_raw_rasterization_runs_between_two_graphs():
@@ -316,8 +297,7 @@ def test_raw_rasterization_runs_between_two_graphs():
 
     means = scene.means.clone().requires_grad_()
     compiled = torch.compile(loss, backend="aot_eager")
-    found, wanted = (torch.autograd.grad(call(means), means)[0] for call in (compiled, loss))
-    assert relative_error(found, wanted) < 1e-6
+    agree(*(torch.autograd.grad(call(means), means) for call in (compiled, loss)), 1e-6)
     torch._dynamo.reset()
     with pytest.raises(Exception, match="blitzgs.raw_rasterization runs between two graphs"):
         torch.compile(loss, fullgraph=True, backend="aot_eager")(means)
@@ -348,13 +328,13 @@ def test_the_gradient_of_a_pixel_without_gaussians_reaches_none(device, options)
         scene = replace(scene, colors=torch.rand(12, channels, device=device), sh_degree=None)
     gradients = []
     for at_empty_pixels in (0.0, torch.nan):
-        own = replace(scene, **{n: getattr(scene, n).detach().requires_grad_() for n in PARAMETERS})
+        own = scene.leaves()
         image, alphas, _ = rasterize_scene(own, **options)
         empty = alphas == 0
         assert 0 < empty.sum() < empty.numel()
         given = torch.where(empty, at_empty_pixels, torch.ones_like(image))
         torch.autograd.backward([image, alphas], [given, given[..., :1]])
-        gradients.append([getattr(own, name).grad for name in PARAMETERS])
+        gradients.append(own.gradients())
     for expected, found in zip(*gradients, strict=True):
         assert expected.any()
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)

@@ -14,7 +14,7 @@ from blitzgs.reference.projection import covariance_factors
 from tests.helpers import (
     BACKENDS,
     DEVICES,
-    PARAMETERS,
+    agree,
     random_scene,
     rasterize_scene,
     refused,
@@ -90,17 +90,6 @@ def test_noise_has_the_covariance_of_the_paper(device):
     normal = noise.double() @ precis[0] / share
     assert (normal.mean(0).abs() < 5 / math.sqrt(n)).all()
     assert relative_error(normal.T @ normal / n, torch.eye(3)) < 0.04
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_neighbours(backend):
-    device, dtype = backend
-    points = torch.randn(200, 3, generator=torch.Generator().manual_seed(0)).to(device, dtype)
-    points[7] = points[9]
-    distances = torch.cdist(points.double(), points.double(), compute_mode="donot_use_mm_for_euclid_dist")
-    distances.fill_diagonal_(math.inf)
-    expected = distances.sort(dim=1).values[:, :3]
-    assert relative_error(blitzgs.knn(points, 3), expected) < 1e-6
 
 
 def test_wrong_points_and_opacities_are_named():
@@ -266,10 +255,9 @@ def test_images_and_gradients_of_more_channels_are_those_of_the_kernels(options,
     for channels in (3, 5):
         leaves = with_channels(scene, channels).leaves() if channels > 3 else scene.leaves()
         image = rasterize_scene(leaves, **options)[0][..., channels - 3 :]
-        gradients = torch.autograd.grad(image.sin().sum(), [getattr(leaves, name) for name in PARAMETERS])
+        gradients = torch.autograd.grad(image.sin().sum(), leaves.parameters())
         results.append([image, *(g[..., -3:] if g.shape[-1] == channels else g for g in gradients)])
-    for actual, expected in zip(*reversed(results), strict=True):
-        assert relative_error(actual, expected) < 1e-10
+    agree(*results, 1e-10)
 
 
 def test_degree_4_is_degree_3_and_nine_more_functions():

@@ -190,7 +190,7 @@ def test_lenses_that_are_not_finite_are_named():
         ({"with_ut": True, "viewmats_rs": torch.eye(4)[None]}, "a rolling shutter needs viewmats_rs"),
         ({"with_ut": True, "rolling_shutter": RollingShutterType(0)}, "a rolling shutter needs viewmats_rs"),
         ({"with_ut": True, "with_eval3d": True}, "does not support with_eval3d=True"),
-        ({"with_ut": True, "camera_model": "ftheta"}, "camera_model must be 'pinhole' or 'fisheye'"),
+        ({"with_ut": True, "camera_model": "ftheta"}, "camera_model must be one of pinhole, fisheye, got"),
     ],
 )
 def test_what_does_not_go_together_is_refused_by_name(options, message):

@@ -137,9 +137,7 @@ def test_gradients_add_up_after_a_view_of_nothing(device):
     sparse, dense = raw_parameters(scene), raw_parameters(scene)
     for p, is_sparse in ((sparse, True), (dense, False)):
         for view, mode in enumerate(("RGB", "D", "RGB")):
-            one = random_scene(n=1, cameras=1, width=20, height=16, device=device)
-            one.viewmats, one.Ks = scene.viewmats[view][None], scene.Ks[view][None]
-            raw(p, one, render_mode=mode, sparse_grad=is_sparse)[0].square().sum().backward()
+            raw(p, scene.view(view), render_mode=mode, sparse_grad=is_sparse)[0].square().sum().backward()
     for name in NAMES:
         assert relative_error(sparse[name].grad.to_dense(), dense[name].grad) < 1e-4, name
 
@@ -160,9 +158,7 @@ def test_lazy_steps_are_those_of_dense_adam(backend, in_one):
         optimizers = {group["name"]: LazyAdam([group], eps=1e-15) for group in groups}
     generator = torch.Generator().manual_seed(2)
     for _ in range(14):
-        one = random_scene(n=1, cameras=1, width=20, height=16)
-        view = torch.randint(6, (1,), generator=generator).item()
-        one.viewmats, one.Ks = scene.viewmats[view, None], scene.Ks[view, None]
+        one = scene.view(torch.randint(6, (1,), generator=generator).item())
         target = torch.rand(1, 16, 20, 3, generator=generator).to(device, dtype)
         for p, image in ((dense, activated(dense, one)[0]), (lazy, raw(lazy, one, optimizers=optimizers)[0])):
             for param in p.values():
@@ -280,9 +276,7 @@ def test_gradients_of_two_views_may_come_at_once(device):
         {"optimizers": LazyAdam([{"params": [t], "name": name} for name, t in p.items()], lr=0.0)}
         for p in (together, one_by_one)
     ]
-    views = [random_scene(n=1, cameras=1, width=20, height=16) for _ in range(2)]
-    for number, view in enumerate(views):
-        view.viewmats, view.Ks = scene.viewmats[number, None], scene.Ks[number, None]
+    views = [scene.view(number) for number in range(2)]
     for _ in range(2):
         images = [raw(together, view, **options[0])[0] for view in views]
         sum(image.square().sum() for image in images).backward()
@@ -305,9 +299,8 @@ def test_a_call_is_repeated_if_there_was_too_little_room():
     expected, actual = raw_parameters(scene), raw_parameters(scene)
     optimizers = LazyAdam([{"params": [t], "lr": 2.0**-12, "name": name} for name, t in actual.items()])
     dense = torch.optim.Adam([{"params": [t], "lr": 2.0**-12} for t in expected.values()], eps=1e-8)
-    view = random_scene(n=1, cameras=1, width=96, height=80)
     for number in (1, 1, 0, 1, 0):
-        view.viewmats, view.Ks = scene.viewmats[number, None], scene.Ks[number, None]
+        view = scene.view(number)
         image = activated(expected, view)[0]
         own = raw(actual, view, optimizers=optimizers)[0]
         assert relative_error(own, image) < 1e-4

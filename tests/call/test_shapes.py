@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Batches, any number of views, colours per view and covariances work; wrong shapes are refused."""
 
-import enum
 import math
 from dataclasses import replace
 
@@ -10,7 +9,8 @@ import torch
 
 import blitzgs
 from blitzgs.reference.projection import covariance_factors
-from tests.helpers import DEVICES, PARAMETERS, random_scene, rasterize_scene, refused, relative_error
+from tests.call.test_lenses import RollingShutterType
+from tests.helpers import DEVICES, PARAMETERS, agree, random_scene, rasterize_scene, refused, relative_error
 
 PER_ROW = ("radii", "means2d", "depths", "conics", "opacities", "tiles_per_gauss")
 
@@ -48,8 +48,7 @@ def test_a_batch_renders_as_its_scenes_alone(device, packed, colors):
         assert torch.equal(renders[index], singles[-1][0])
         assert torch.equal(alphas[index], singles[-1][1])
         singles[-1][0].square().sum().backward()
-        for name in PARAMETERS:
-            assert relative_error(getattr(batch, name).grad[index], getattr(leaves, name).grad) < 1e-4, name
+        agree([gradient[index] for gradient in batch.gradients()], leaves.gradients(), 1e-4)
     together = torch.cat if packed else torch.stack
     for name in PER_ROW + (("camera_ids", "gaussian_ids") if packed else ()):
         assert torch.equal(meta[name], together([single[2][name] for single in singles])), name
@@ -90,8 +89,7 @@ def test_any_number_of_views(device, with_sh):
         expected, _, _ = rasterize_scene(some)
         assert torch.equal(renders[view], expected)
         expected.square().sum().backward()
-    for name in PARAMETERS:
-        assert relative_error(getattr(leaves, name).grad, getattr(parts, name).grad) < 1e-4, name
+    agree(leaves.gradients(), parts.gradients(), 1e-4)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -102,10 +100,7 @@ def test_sh_may_differ_from_view_to_view(device):
     renders, _, _ = rasterize_scene(leaves)
     renders.square().sum().backward()
     for view in range(3):
-        one = replace(
-            scene, colors=per_view[view], viewmats=scene.viewmats[view, None], Ks=scene.Ks[view, None]
-        )
-        one = one.leaves()
+        one = replace(scene.view(view), colors=per_view[view]).leaves()
         expected, _, _ = rasterize_scene(one)
         assert torch.equal(renders[view], expected[0])
         expected.square().sum().backward()
@@ -134,6 +129,11 @@ def test_depth_needs_no_colours(device, mode):
     refused(ValueError, "colors may be None for the render modes D and ED alone", rasterize_scene, scene)
 
 
+def covariances(scene):
+    factors = covariance_factors(scene.quats.view(-1, 4), scene.scales.view(-1, 3))
+    return (factors @ factors.mT).view(*scene.scales.shape[:-1], 3, 3)
+
+
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
 def test_covariances_are_rotations_and_scales(device, rasterize_mode):
@@ -143,28 +143,18 @@ def test_covariances_are_rotations_and_scales(device, rasterize_mode):
     scene.scales[:20] = scene.scales[:20, :1]  # round: any axes are eigenvectors
     scene.scales[20:40, 1] = scene.scales[20:40, 0]
     expected, given = scene.leaves(), scene.leaves()
-    factors = covariance_factors(expected.quats, expected.scales)
-    covars = factors @ factors.mT
-    covars.retain_grad()
     image, alphas, _ = rasterize_scene(expected, rasterize_mode=rasterize_mode)
-    own = covars.detach().clone().requires_grad_()
+    own = covariances(expected).detach().requires_grad_()
     given.quats = given.scales = None
     renders, own_alphas, _ = rasterize_scene(given, covars=own, rasterize_mode=rasterize_mode)
     assert relative_error(renders, image) < bound and relative_error(own_alphas, alphas) < bound
     image.square().sum().backward()
     renders.square().sum().backward()
-    for name in ("means", "opacities", "colors", "viewmats"):
-        assert relative_error(getattr(given, name).grad, getattr(expected, name).grad) < 10 * bound, name
+    others = ("means", "opacities", "colors", "viewmats")
+    agree(*([getattr(scene, name).grad for name in others] for scene in (given, expected)), 10 * bound)
     assert not own.grad[:, [1, 2, 2], [0, 0, 1]].any()  # the lower triangle is not read
-    scales, quats = torch.autograd.grad(
-        covariance_factors(expected.quats, expected.scales).matmul(
-            covariance_factors(expected.quats, expected.scales).mT
-        ),
-        [expected.scales, expected.quats],
-        own.grad,
-    )
-    assert relative_error(scales, expected.scales.grad) < 10 * bound
-    assert relative_error(quats, expected.quats.grad) < 10 * bound
+    found = torch.autograd.grad(covariances(expected), [expected.scales, expected.quats], own.grad)
+    agree(found, [expected.scales.grad, expected.quats.grad], 10 * bound)
 
 
 def test_covariances_have_no_sparse_gradients():
@@ -179,9 +169,7 @@ def test_covariances_have_no_sparse_gradients():
 def test_covariances_of_a_batch(device):
     scenes = [random_scene(n=20, cameras=2, seed=seed, device=device) for seed in range(2)]
     batch = batch_of(scenes)
-    factors = covariance_factors(batch.quats.flatten(0, 1), batch.scales.flatten(0, 1))
-    covars = (factors @ factors.mT).view(2, 20, 3, 3)
-    renders, _, _ = rasterize_scene(replace(batch, quats=None, scales=None), covars=covars)
+    renders, _, _ = rasterize_scene(replace(batch, quats=None, scales=None), covars=covariances(batch))
     assert relative_error(renders, rasterize_scene(batch)[0]) < 1e-4
 
 
@@ -201,18 +189,14 @@ def test_no_covariances_are_an_empty_image(batch):
 def test_covariances_of_needles_whose_tiles_depend_on_rounding(seed):
     scene = random_scene(n=200, cameras=1, seed=seed, scale=0.3)
     scene.scales[:, 1:] *= 1e-3
-    factors = covariance_factors(scene.quats, scene.scales)
-    scene.quats = scene.scales = None
-    renders, _, meta = rasterize_scene(scene, covars=factors @ factors.mT, eps2d=0.0)
+    renders, _, meta = rasterize_scene(scene, covars=covariances(scene), eps2d=0.0)
     assert renders.isfinite().all() and len(meta["flatten_ids"]) > 300
 
 
 def test_covariances_without_a_determinant_have_finite_gradients():
     scene = random_scene(n=200, cameras=1, dtype=torch.float64)
     scene.scales[:, 1:] *= 1e-9
-    factors = covariance_factors(scene.quats, scene.scales)
-    scene.quats = scene.scales = None
-    covars = (factors @ factors.mT).requires_grad_()
+    covars = covariances(scene).requires_grad_()
     renders, _, _ = rasterize_scene(scene, covars=covars, eps2d=0.0)
     renders.sum().backward()
     assert renders.isfinite().all() and covars.grad.isfinite().all()
@@ -220,8 +204,7 @@ def test_covariances_without_a_determinant_have_finite_gradients():
 
 def test_a_covariance_that_is_not_finite_is_not_rendered():
     scene = random_scene(n=20, cameras=1)
-    factors = covariance_factors(scene.quats, scene.scales)
-    covars = factors @ factors.mT
+    covars = covariances(scene)
     covars[3, 0, 1] = torch.nan
     scene.opacities[3] = 0
     expected, _, _ = rasterize_scene(scene, covars=covars)
@@ -230,13 +213,6 @@ def test_a_covariance_that_is_not_finite_is_not_rendered():
         image, _, meta = rasterize_scene(scene, covars=covars)
     assert torch.equal(image, expected)
     assert meta["non_finite"]["covars"].tolist() == [3]
-
-
-class RollingShutterType(enum.Enum):
-    """As gsplat has it."""
-
-    ROLLING_TOP_TO_BOTTOM = 0
-    GLOBAL = 4
 
 
 class RendererConfig_MixedBatch:  # noqa: N801
@@ -254,16 +230,12 @@ DEFAULTS = {
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_colours_in_half_precision_are_those_in_single(dtype):
     scene = random_scene(n=40)
-    arguments = list(scene.arguments())
-    half = arguments[4].to(dtype).requires_grad_()
+    half = scene.colors.to(dtype).requires_grad_()
     single = half.detach().float().requires_grad_()
-    images = []
-    for colors in (half, single):
-        arguments[4] = colors
-        renders = blitzgs.rasterization(*arguments, sh_degree=scene.sh_degree)[0]
-        renders.square().sum().backward()
-        images.append(renders)
+    images = [rasterize_scene(replace(scene, colors=colors))[0] for colors in (half, single)]
     assert torch.equal(*images)
+    for image in images:
+        image.square().sum().backward()
     assert torch.equal(half.grad, single.grad.to(dtype))
 
 
@@ -379,8 +351,5 @@ def test_sh_of_an_unsupported_degree_are_refused_by_name(count):
 )
 def test_dtypes_and_sizes_that_do_not_fit_are_refused_by_name(changes, error, message):
     scene = random_scene(n=5)
-    names = (*PARAMETERS, "viewmats", "Ks", "width", "height")
-    given = {name: getattr(scene, name) for name in names}
-    for name, change in changes.items():
-        given[name] = change(given[name])
-    refused(error, message, blitzgs.rasterization, **given, sh_degree=scene.sh_degree)
+    changed = replace(scene, **{name: change(getattr(scene, name)) for name, change in changes.items()})
+    refused(error, message, rasterize_scene, changed)

@@ -15,7 +15,7 @@ from blitzgs.reference.render import composited_weights, median_splats
 from tests.helpers import (
     BACKENDS,
     DEVICES,
-    PARAMETERS,
+    agree,
     image_error,
     random_scene,
     rasterize_scene,
@@ -91,10 +91,7 @@ def test_images_and_gradients_are_those_of_the_definition(backend, degree, per_v
         loss = loss + (got * v.to(device, dtype)).sum()
     expected_loss.backward()
     loss.backward()
-    assert relative_error(extra.grad, exact_extra.grad) < MOST[dtype][1]
-    for name in ("means", "quats", "scales", "opacities", "colors", "viewmats"):
-        error = relative_error(getattr(scene, name).grad, getattr(exact, name).grad)
-        assert error < MOST[dtype][1], name
+    agree([extra.grad, *scene.gradients()], [exact_extra.grad, *exact.gradients()], MOST[dtype][1])
 
 
 @pytest.mark.parametrize("packed", [True, False])
@@ -135,19 +132,6 @@ def test_batches_are_scenes_one_by_one():
                 assert torch.equal(meta[key][number], one[key]), key
 
 
-def test_gradcheck():
-    scene = random_scene(n=5, cameras=1, width=6, height=5, seed=2, dtype=torch.float64, scale=0.4)
-
-    def images(means, quats, extra):
-        found, _, meta = images_of(
-            replace(scene, means=means, quats=quats), extra_signals=extra, extra_signals_sh_degree=1
-        )
-        return found, meta["render_median"]
-
-    inputs = (scene.means, scene.quats, signals_of(scene, degree=1)[:, :4])
-    torch.autograd.gradcheck(images, [t.clone().requires_grad_() for t in inputs], atol=1e-5, fast_mode=True)
-
-
 def around(function):
     return partial(torch.utils.checkpoint.checkpoint, function, use_reentrant=False)
 
@@ -176,8 +160,7 @@ def test_checkpointing_and_compiling_change_nothing(device, transform):
         image.square().sum().backward()
         results.append([image.detach(), leaves.means.grad, leaves.quats.grad, extra.grad])
     assert torch.equal(results[0][0], results[1][0])
-    for expected, actual in zip(*results, strict=True):
-        assert relative_error(actual, expected) < 1e-5
+    agree(*results, 1e-5)
 
 
 def test_sparse_gradients_of_rotations_stay_sparse():
@@ -190,8 +173,7 @@ def test_sparse_gradients_of_rotations_stay_sparse():
         (meta["normals"].square().sum() + meta["render_extra_signals"].square().sum()).backward()
         assert scene.quats.grad.is_sparse == scene.means.grad.is_sparse == sparse
         gradients.append([t.grad.to_dense() for t in (scene.means, scene.quats, scene.scales)])
-    for dense, sparse in zip(*gradients, strict=True):
-        assert relative_error(sparse, dense) < 1e-12
+    agree(*gradients, 1e-12)
 
 
 def test_backgrounds_are_behind_the_colours_and_if_given_behind_the_signals():
@@ -289,12 +271,10 @@ def test_pixels_and_gradients_are_those_of_the_image(backend, packed):
             parts = [part[at] for part in parts]
         found.append([part.detach() for part in parts])
         torch.stack([(part * (part.detach() + 1)).sum() for part in parts]).sum().backward()
-        leaves = [*(getattr(scene, name) for name in PARAMETERS), extra, backgrounds]
-        gradients.append([leaf.grad for leaf in leaves])
+        gradients.append([*scene.gradients(), extra.grad, backgrounds.grad])
     assert 0 < entries[1] < 0.6 * entries[0]
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
-    for whole, own in zip(*gradients, strict=True):
-        assert relative_error(own, whole) < (1e-12 if backend[1] == torch.float64 else 1e-4)
+    agree(*gradients, 1e-12 if backend[1] == torch.float64 else 1e-4)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

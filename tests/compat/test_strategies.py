@@ -12,6 +12,7 @@ from blitzgs.compat.gsplat import DefaultStrategy, MCMCStrategy
 from blitzgs.optim import LazyAdam
 from tests.call.test_raw_rasterization import NAMES, activated, raw, raw_parameters
 from tests.helpers import random_scene, rasterize_scene, refused, relative_error
+from tests.population.test_relocation import by_the_double_sum
 
 gsplat = pytest.importorskip("gsplat", reason="needs gsplat, which pip installs without CUDA too")
 
@@ -38,8 +39,7 @@ class Trainer:
         self.state["count"] = torch.zeros(len(scene.means), dtype=torch.float32)  # it adds float32 to it
 
     def render(self, view):
-        one = random_scene(n=1, cameras=1, width=self.scene.width, height=self.scene.height)
-        one.viewmats, one.Ks = self.scene.viewmats[view, None], self.scene.Ks[view, None]
+        one = self.scene.view(view)
         p = {name: self.splats[name] for name in NAMES}
         if self.lazy:
             return raw(p, one, optimizers=self.optimizers)
@@ -213,16 +213,9 @@ def test_absolute_gradients_count_in_half_images():
 
 def relocation(opacities, scales, ratios, binoms, min_opacity=0.005):
     """Kheradmand et al. 2024, eq. 9, as the paper prints it."""
-    shared = 1 - (1 - opacities) ** (1 / ratios)
-    sizes = torch.empty_like(scales)
-    for row, n in enumerate(ratios.tolist()):
-        total = sum(
-            math.comb(i - 1, k) * (-1) ** k * shared[row] ** (k + 1) / math.sqrt(k + 1)
-            for i in range(1, n + 1)
-            for k in range(i)
-        )
-        sizes[row] = scales[row] * opacities[row] / total
-    return shared.clamp(min=min_opacity), sizes
+    rows = [by_the_double_sum(o, n, 0.0) for o, n in zip(opacities.tolist(), ratios.tolist(), strict=True)]
+    shared, factors = torch.tensor(rows).T
+    return shared.clamp(min=min_opacity), scales * factors[:, None]
 
 
 def sample(weights, count, replacement=True):

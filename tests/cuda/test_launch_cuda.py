@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from blitzgs import _library
-from blitzgs.frame.transport import Traffic
 from blitzgs.frame.transport.peer import WORDS_PER_SPLAT, PeerBuffers
+from blitzgs.frame.transport.protocol import Traffic
 from blitzgs.ops.exchange import place_runs
 from blitzgs.ops.host import HostCopy, PinnedNumbers, current_stream
 from blitzgs.ops.photometric import photometric_fwd_bwd

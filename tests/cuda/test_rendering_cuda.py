@@ -8,8 +8,7 @@ import torch
 
 import blitzgs
 from blitzgs.frame.render import backward_splats, render_frame, tile_grid
-from blitzgs.frame.transport import LocalTransport, stages_told_to
-from blitzgs.frame.transport.protocol import CapacityEstimate
+from blitzgs.frame.transport.protocol import CapacityEstimate, LocalTransport, stages_told_to
 from blitzgs.ops import project, splat_gradients
 from blitzgs.ops.projection_types import Sizes, WeightedViews
 from blitzgs.ops.splat_gradients import gradient_columns

@@ -17,7 +17,8 @@ from blitzgs.distributed.shared_memory import MAX_VALUES, SharedMemory, control_
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.render import backward_splats, render_frame
 from blitzgs.frame.tiles import TileAssignment
-from blitzgs.frame.transport import CollectiveTransport, PeerTransport
+from blitzgs.frame.transport.collective import CollectiveTransport
+from blitzgs.frame.transport.peer import PeerTransport
 from blitzgs.frame.transport.protocol import CapacityEstimate
 from blitzgs.ops.splat_gradients import SplatGradients, gradient_columns
 from blitzgs.optim.table_adam import TableAdam
@@ -61,7 +62,7 @@ def _exchange(table, ranks, transport):
     else:
         sums = frame.way_back.return_gradients(SplatGradients(gradients)).parts
     own = assignment.ranges.pixel_mask(ranks.rank, ranks.device)
-    return [*arrived, *sums, frame.renders[own], frame.visible.clone()], frame.traffic.needed
+    return [*arrived, *sums, frame.renders[own], frame.visible.clone()], frame.way_back.traffic.needed
 
 
 def _both_ways(ranks):

@@ -5,7 +5,6 @@ The tests check that all ranks reach the same number of barriers, also if the ca
 small, and that splats and gradients are in the places that the transport names.
 """
 
-import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -13,59 +12,19 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.shared_memory import Shared
 from blitzgs.frame.render import backward_splats, render_frame, survey
 from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
-from blitzgs.frame.transport import PeerTransport, peer
-from blitzgs.frame.transport.peer import WORDS_PER_SPLAT, PeerWayBack, room_for
+from blitzgs.frame.transport.peer import WORDS_PER_SPLAT, PeerTransport, PeerWayBack, room_for
 from blitzgs.frame.transport.protocol import CapacityEstimate
-from blitzgs.ops.exchange import gather_splats, scatter_splats, words_of
-from blitzgs.ops.projection_types import VIEW_TOTALS, Sizes
+from blitzgs.ops.projection_types import Sizes
 from blitzgs.table.table import GaussianTable
 from tests.frame.test_sharded_rendering import OPTIONS, cameras
-from tests.frame.test_transport import IdleEvent, rasterize_into
+from tests.frame.without_gpu import Host, Memory, replace_cuda
 from tests.helpers import sum_of_ranks
 from tests.training.tiny import random_gaussians
 
-VIEWS, PATIENCE = 3, 30.0
+VIEWS = 3
 INTERSECT = torch.ops.blitzgs.intersect
-
-
-class Host:
-    """The state that the ranks share."""
-
-    def __init__(self, world_size):
-        self.meeting = threading.Barrier(world_size, timeout=PATIENCE)
-        self.slots = [None] * world_size
-
-    def gather(self, rank, value):
-        """Return every rank's value. Collective."""
-        self.slots[rank] = value
-        self.meeting.wait()
-        values = list(self.slots)
-        self.meeting.wait()
-        return values
-
-
-class Memory:
-    """A stand-in for `SharedMemory` of one rank."""
-
-    def __init__(self, host, rank):
-        self.host, self.rank, self.generation, self.log = host, rank, 0, []
-        self.reserve(32 * WORDS_PER_SPLAT)
-
-    def barrier(self):
-        self.log.append("barrier")
-        self.host.meeting.wait()
-
-    def share(self, values):
-        self.log.append("share")
-        everyone = torch.stack(self.host.gather(self.rank, values))
-        return Shared(everyone, everyone.sum(0), everyone.clone())
-
-    def reserve(self, words):
-        self.log.append(("reserve", words))
-        self.buffers = self.host.gather(self.rank, torch.full((words,), -1, dtype=torch.int32))
 
 
 class ThreadRanks(Ranks):
@@ -78,28 +37,6 @@ class ThreadRanks(Ranks):
         return torch.cat(parts)
 
 
-def _send(columns, masks, everyone, rank, buffers, capacity):
-    """Replaces `send_splats_`."""
-    world_size = len(buffers)
-    n_views = everyone.shape[1] - VIEW_TOTALS - 2 * world_size
-    splats = everyone[:, VIEW_TOTALS + n_views :: 2].tolist()
-    most = max(*everyone[:, 1].tolist(), *map(sum, splats), *map(sum, zip(*splats, strict=True)))
-    if most > capacity:
-        return torch.empty(0, world_size, dtype=torch.int64), torch.tensor([0])
-    count = int(everyone[rank, 1])
-    numbers = torch.arange(count, dtype=torch.int32)
-    packed, places = scatter_splats([numbers], masks[:count], splats[rank])
-    (numbers,) = gather_splats(packed, [numbers], splats[rank])
-    for m, which in enumerate(numbers.long().split(splats[rank])):
-        at, begin = sum(sent[m] for sent in splats[:rank]), 0
-        for column in columns:
-            words = words_of(column[:count])
-            width = words.shape[1]
-            buffers[m][begin + at * width :][: len(which) * width] = words[which].flatten()
-            begin += capacity * width
-    return places, torch.tensor([sum(sent[rank] for sent in splats)])
-
-
 def _intersect(*arguments):
     """Replaces `intersect` for a capacity below the number of entries, which the CPU op refuses."""
     *given, _, n_splats, _ = arguments
@@ -108,11 +45,8 @@ def _intersect(*arguments):
 
 @pytest.fixture(autouse=True)
 def without_gpu(monkeypatch):
-    monkeypatch.setattr(torch.ops.blitzgs, "send_splats_", _send)
-    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_", rasterize_into)
+    replace_cuda(monkeypatch)
     monkeypatch.setattr(torch.ops.blitzgs, "intersect", _intersect)
-    monkeypatch.setattr(torch.cuda, "Event", IdleEvent)
-    monkeypatch.setattr(peer, "current_stream", lambda _: None)
     returned = PeerWayBack.return_gradients
 
     def from_columns(self, gradients):

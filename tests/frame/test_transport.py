@@ -1,28 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Transports of splats between ranks, with doubles that record calls or stand for a GPU."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest
 import torch
-from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.shared_memory import Shared
 from blitzgs.frame.render import render_frame, run_attempts
 from blitzgs.frame.tiles import LOSS_HALO, TileAssignment, TileRanges
-from blitzgs.frame.transport import CollectiveTransport, LocalTransport, PeerTransport, open_transport, peer
-from blitzgs.frame.transport.peer import WORDS_PER_SPLAT
-from blitzgs.frame.transport.protocol import (
-    CapacityEstimate,
-    Exchange,
-    ExchangeResult,
-    Traffic,
-    Transport,
-    WayBack,
-)
+from blitzgs.frame.transport import open_transport
+from blitzgs.frame.transport.collective import CollectiveTransport
+from blitzgs.frame.transport.peer import WORDS_PER_SPLAT, PeerTransport
+from blitzgs.frame.transport.protocol import CapacityEstimate, LocalTransport, Traffic, WayBack
 from blitzgs.ops.exchange import scatter_splats
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project_splats
@@ -30,86 +20,28 @@ from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Si
 from blitzgs.ops.splat_gradients import SplatGradients
 from tests.distributed.rank_harness import run_ranks
 from tests.frame.test_sharded_rendering import OPTIONS, cameras
+from tests.frame.without_gpu import Host, Memory, replace_cuda
 from tests.helpers import parameter_gradients, refused, sum_of_ranks
 from tests.training.tiny import random_gaussians
 
 
-class RecordingTransport:
-    """Wraps a transport; its first exchanges fail as if the capacity were too small.
+class TooSmall(LocalTransport):
+    """A transport whose first exchanges fail as if the capacity were too small."""
 
-    Attributes:
-        calls: "start", with its capacity, and "finish", in order.
-    """
+    def __init__(self, too_small):
+        super().__init__()
+        self.too_small, self.capacities = too_small, []
 
-    def __init__(
-        self, inner: Transport, too_small: int = 0, estimate: CapacityEstimate | None = None
-    ) -> None:
-        """Wrap a transport; its first `too_small` exchanges do not finish."""
-        self.estimate = estimate or inner.estimate
-        self.inner, self.too_small = inner, too_small
-        self.calls: list[tuple[str, Sizes | None]] = []
+    def project_and_send(self, inputs, assignment, capacity):
+        self.capacities.append(capacity)
+        exchange = super().project_and_send(inputs, assignment, capacity)
 
-    def project_and_send(
-        self, inputs: ProjectionInputs, assignment: TileAssignment | None, capacity: Sizes | None
-    ) -> RecordingExchange:
-        """See `Transport.project_and_send`."""
-        self.calls.append(("start", capacity))
-        return RecordingExchange(self, self.inner.project_and_send(inputs, assignment, capacity))
+        def finish():
+            needed, result = exchange.finish()
+            self.too_small -= 1
+            return needed, None if self.too_small >= 0 else result
 
-
-class RecordingExchange:
-    """An exchange of a `RecordingTransport`."""
-
-    def __init__(self, transport: RecordingTransport, inner: Exchange) -> None:
-        """Wrap an exchange."""
-        self._transport, self._inner = transport, inner
-        self.arrived, self.gradient_table = inner.arrived, inner.gradient_table
-
-    def finish(self) -> tuple[Sizes, ExchangeResult | None]:
-        """See `Exchange.finish`."""
-        self._transport.calls.append(("finish", None))
-        needed, result = self._inner.finish()
-        if self._transport.too_small > 0:
-            self._transport.too_small -= 1
-            return needed, None
-        return needed, result
-
-
-class LoneMemory:
-    """A `SharedMemory` of a single rank, on any device, for tests of transports that need one."""
-
-    def __init__(self, words: int) -> None:
-        """Begin with a buffer of this number of words."""
-        self.buffers = [torch.full((words,), -1, dtype=torch.int32)]
-        self.generation = 0
-
-    def barrier(self) -> None:
-        """Return at once: there is no other rank."""
-
-    def share(self, values: Tensor) -> Shared:
-        """Return the rank's own numbers."""
-        return Shared(values[None], values, values[None])
-
-    def reserve(self, words: int) -> None:
-        """Enlarge the buffer."""
-        self.buffers = [torch.full((words,), -1, dtype=torch.int32)]
-
-
-class IdleEvent:
-    """Replaces `torch.cuda.Event` on a CPU, where nothing is pending."""
-
-    def record(self, stream: object = None) -> None:
-        """Return at once."""
-
-    def synchronize(self) -> None:
-        """Return at once."""
-
-
-def rasterize_into(*arguments):
-    """Replaces `rasterize_fwd_` on a CPU."""
-    *rest, table, n_splats = arguments
-    table[: int(n_splats)] = 0
-    return torch.ops.blitzgs.rasterize_fwd(*rest, False, False, n_splats)[:6]
+        return exchange._replace(finish=finish)
 
 
 WIDTH, HEIGHT, CAMERAS = 100, 60, 2
@@ -169,8 +101,9 @@ def _round_trip(ranks, capacity):
     got = exchange.arrived.splats
     assert exchange.gradient_table is None
     needed, result = exchange.finish()
-    projected, splats, visible, traffic, way_back = result
-    assert list(needed[:3]) == projected.counts.tolist()
+    projected, splats, totals, visible, way_back = result
+    assert list(needed[:3]) == projected.counts.tolist() == totals[:3]
+    traffic = way_back.traffic
     assert splats is got and sum(traffic.received) == len(got.ids)
     for _ in range(2):
         way_back.check_still_valid()
@@ -233,27 +166,9 @@ def test_splats_reach_their_tiles_and_gradients_return(world_size, capacity):
 
 @pytest.fixture
 def alone(monkeypatch):
-    """One rank that writes to its own memory, without a GPU: a function replaces the op that sends."""
-
-    def send(columns, masks, everyone, rank, buffers, capacity):
-        n_splats = int(everyone[0, 1])
-        plan = torch.tensor([int(everyone[0, -2]) if n_splats <= capacity else 0])
-        goes = (masks[:n_splats] == 1).nonzero().squeeze(1) if n_splats <= capacity else masks[:0]
-        begin = 0
-        for column in columns:
-            words = column.reshape(len(column), -1).view(torch.int32)
-            target = buffers[0][begin:][: capacity * words.shape[1]].view(capacity, words.shape[1])
-            target[: len(goes)] = words[goes]
-            begin += capacity * words.shape[1]
-        number = torch.arange(n_splats, dtype=torch.int32)
-        return scatter_splats([number], masks[:n_splats], [int((masks[:n_splats] == 1).sum())])[1], plan
-
-    monkeypatch.setattr(torch.ops.blitzgs, "send_splats_", send)
-
-    monkeypatch.setattr(torch.cuda, "Event", IdleEvent)
-    monkeypatch.setattr(peer, "current_stream", lambda _: None)
-    monkeypatch.setattr(torch.ops.blitzgs, "rasterize_fwd_", rasterize_into)
-    return Ranks(memory=LoneMemory(64 * WORDS_PER_SPLAT))
+    """One rank that writes to its own memory."""
+    replace_cuda(monkeypatch)
+    return Ranks(memory=Memory(Host(1), 0))
 
 
 def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):
@@ -328,18 +243,16 @@ def test_a_transport_that_does_not_serve_the_job_says_so():
 
 def test_one_rank_needs_no_way_back():
     _, result = LocalTransport().project_and_send(scene(), None, None).finish()
-    assert result.way_back is None and result.traffic is None
+    assert result.way_back is None
 
 
 def test_a_frame_that_did_not_fit_is_rendered_again_but_not_for_ever():
     table, views = random_gaussians(300), cameras(2)
     expected = render_frame(table, views, OPTIONS)
-    transport = RecordingTransport(LocalTransport(), too_small=2)
+    transport = TooSmall(2)
     frame = render_frame(table, views, OPTIONS, transport=transport)
-    names = [name for name, _ in transport.calls]
-    assert names == ["start", "finish"] * 3
-    capacities = [capacity for name, capacity in transport.calls if name == "start"]
-    assert capacities[0] is None and capacities[1].holds(expected.projected.counts)
+    first, second, _ = transport.capacities
+    assert first is None and second.holds(expected.projected.counts)
     assert torch.equal(frame.renders, expected.renders)
     v_renders = torch.ones_like(frame.renders)
     gradients = parameter_gradients(table, frame, v_renders)

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random projected splats, and a dense compositor in plain torch: the definition of the image."""
+"""Random projected splats, and their images by definition."""
 
 import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+from blitzgs.reference import composite
 
 
 @dataclass
@@ -78,41 +80,19 @@ def pixel_alphas(means2d, conics, opacities, width, height):
     return (opacities[:, None, None] * torch.exp(power)).clamp(max=0.99)
 
 
-def dense_composite(splats, width, height, n_cameras=1, backgrounds=None):
-    """Composite every splat over every pixel: renders [B, H, W, D] and alphas [B, H, W]."""
-    order = torch.argsort(splats.depths, stable=True)
-    renders, remainders = [], []
+def by_definition(splats, width, height, n_cameras=1, backgrounds=None):
+    """Return renders [B, H, W, D], alphas [B, H, W] and the pixels at a cut, bool [B, H, W]."""
+    renders, alphas, cuts = [], [], []
     for camera in range(n_cameras):
-        here = order[splats.camera_ids[order] == camera]
-        alphas = pixel_alphas(*(t[here] for t in splats.values()[:3]), width, height)
-        alphas = torch.where(_drawn(alphas.detach()), alphas, 0.0)
-        ends = torch.cumprod(torch.cat([torch.ones_like(alphas[:1]), 1 - alphas]), 0)
-        color = torch.einsum("phw,phw,pd->hwd", alphas, ends[:-1], splats.colors[here])
-        if backgrounds is not None:
-            color = color + ends[-1][..., None] * backgrounds[camera]
-        renders.append(color)
-        remainders.append(ends[-1])
-    return torch.stack(renders), 1 - torch.stack(remainders)
-
-
-def _drawn(alphas):
-    """Return which splats, front to back, each pixel composites: bool [P, H, W]."""
-    drawn = torch.zeros_like(alphas, dtype=torch.bool)
-    rest, running = torch.ones_like(alphas[0]), torch.ones_like(alphas[0], dtype=torch.bool)
-    for i, alpha in enumerate(alphas):
-        touched = running & (alpha >= 1 / 255)
-        after = rest * (1 - alpha)
-        drawn[i] = touched & (after >= 1e-4)
-        running &= drawn[i] | ~touched
-        rest = torch.where(drawn[i], after, rest)
-    return drawn
-
-
-def near_a_cut(splats, width, height, margin=1e-5):
-    """Return the pixels [B, H, W] with an alpha so near to 1/255 that rounding may decide."""
-    alphas = pixel_alphas(*(t.double() for t in splats.values()[:3]), width, height)
-    close = ((alphas * 255 - 1).abs() < margin).any(0)
-    return close[None]
+        here = (splats.camera_ids == camera).nonzero()[:, 0]
+        here = here[splats.depths[here].argsort(stable=True)]
+        columns = (column[here] for column in (*splats.values(), splats.depths))
+        image = composite(*columns, width, height, tolerance=1e-5)
+        behind = 0 if backgrounds is None else image.transmittances[..., None] * backgrounds[camera]
+        renders.append(image.values + behind)
+        alphas.append(1 - image.transmittances)
+        cuts.append(image.cut)
+    return torch.stack(renders), torch.stack(alphas), torch.stack(cuts)
 
 
 def with_capacity(column, capacity):

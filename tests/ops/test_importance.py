@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import blitzgs
-from blitzgs.ops.importance import CHOICE_STEP, ROUNDS, STEPS, TIES_STEP, UNITS, MassCut, splat_contributions
+from blitzgs.ops.importance import CHOICE_STEP, ROUNDS, STEPS, TIES_STEP, UNITS, MassCut
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project
 from blitzgs.ops.rasterize import rasterize
@@ -33,6 +33,10 @@ def lists_of(scene, tile_size=16):
     return splats, intersect(*splats, projected.depths, projected.camera_ids, **grid), grid
 
 
+def splat_contributions(splats, lists, grid, tiles=(0, -1), squares=False):
+    return torch.ops.blitzgs.contributions(*splats, *lists, *grid.values(), *tiles, None, squares)
+
+
 def crowded(device="cpu", dtype=torch.float32):
     """Opaque splats in front of others, so that pixels end, over several tiles and uneven borders."""
     scene = random_scene(150, 3, 45, 37, seed=3, scale=0.2)
@@ -50,7 +54,7 @@ def test_sees_what_the_renderer_composites_bit_for_bit(backend, tile_size):
     count = len(splats[0])
     channels = torch.eye(count, device=backend[0], dtype=backend[1])
     images, _ = rasterize(*splats, channels, *lists, **grid)
-    weights, pixels, squares = splat_contributions(*splats, *lists, **grid, squares=True)
+    weights, pixels, squares = splat_contributions(splats, lists, grid, squares=True)
     shares = images.double() * UNITS
     assert torch.equal(weights, shares.round().long().sum((0, 1, 2)))
     assert torch.equal(pixels, (images > 0).sum((0, 1, 2)).int())
@@ -60,23 +64,23 @@ def test_sees_what_the_renderer_composites_bit_for_bit(backend, tile_size):
     )  # of 64 bits, of which neither int64 nor float64 holds all
     assert torch.equal(squares, exact.sum((0, 1, 2)))
     assert pixels.max() > 100 and (pixels == 0).any()
-    without = splat_contributions(*splats, *lists, **grid)
+    without = splat_contributions(splats, lists, grid)
     assert torch.equal(without[0], weights) and torch.equal(without[1], pixels) and not len(without[2])
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_parts_add_up_and_repeat(backend):
     splats, lists, grid = lists_of(crowded(*backend))
-    sums = splat_contributions(*splats, *lists, **grid, squares=True)
+    sums = splat_contributions(splats, lists, grid, squares=True)
     tiles = len(lists[1]) - 1
     cuts = [0, 1, 1, 7, 20, tiles]
     parts = [
-        splat_contributions(*splats, *lists, **grid, tile_begin=begin, tile_end=end, squares=True)
+        splat_contributions(splats, lists, grid, (begin, end), squares=True)
         for begin, end in zip(cuts, cuts[1:], strict=False)
     ]
     assert all(torch.equal(sum(pieces), whole) for *pieces, whole in zip(*parts, sums, strict=True))
     for _ in range(3):
-        again = splat_contributions(*splats, *lists, **grid, squares=True)
+        again = splat_contributions(splats, lists, grid, squares=True)
         assert all(torch.equal(a, b) for a, b in zip(again, sums, strict=True))
 
 
@@ -139,10 +143,10 @@ def test_hidden_and_missing_gaussians_contribute_nothing():
 def test_bad_arguments_are_named():
     splats, lists, grid = lists_of(random_scene(5))
     with pytest.raises(RuntimeError, match="contributions: conics must have shape"):
-        splat_contributions(splats[0], splats[1][:, :2], splats[2], *lists, **grid)
+        splat_contributions((splats[0], splats[1][:, :2], splats[2]), lists, grid)
     with pytest.raises(RuntimeError, match="tile_begin and tile_end must be a range"):
-        splat_contributions(*splats, *lists, **grid, tile_begin=5, tile_end=99)
-    with pytest.raises(ValueError, match="rasterize_mode must be 'classic' or 'antialiased', got 'ewa'"):
+        splat_contributions(splats, lists, grid, (5, 99))
+    with pytest.raises(ValueError, match="rasterize_mode must be one of classic, antialiased, got 'ewa'"):
         blitzgs.contributions(*splats, splats[2], *lists, 4, 4, rasterize_mode="ewa")
 
 

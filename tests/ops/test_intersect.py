@@ -6,10 +6,11 @@ import torch
 
 from blitzgs.ops.intersect import intersect, tile_counts
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT
-from tests.helpers import DEVICES, needs_cuda, refused
+from tests.helpers import DEVICES, needs_cuda, on_threads, refused
 from tests.ops.splats import Splats, kept_by, pixel_alphas, random_splats, with_capacity
 
 WIDTH, HEIGHT = 91, 70
+GRID = {"n_cameras": 1, "width": WIDTH, "height": HEIGHT}
 
 
 def listed(splats, width, height, tile_size, **options):
@@ -87,7 +88,7 @@ def test_lists_are_ordered_by_depth_then_id():
     splats.depths = (splats.depths * 40).round() / 40  # many ties
     ids = torch.randperm(2000, generator=torch.Generator().manual_seed(3))
     for given in (None, ids):
-        entries, offsets = intersect(*splats.geometry(), given, n_cameras=3, width=WIDTH, height=HEIGHT)
+        entries, offsets = intersect(*splats.geometry(), given, **GRID | {"n_cameras": 3})
         tiebreak = torch.arange(2000) if given is None else given
         per_image = (len(offsets) - 1) // 3
         for tile in range(len(offsets) - 1):
@@ -100,7 +101,7 @@ def test_lists_are_ordered_by_depth_then_id():
 def test_negative_and_float64_depths_keep_their_order():
     splats = random_splats(400, WIDTH, HEIGHT, largest=60, dtype=torch.float64)
     splats.depths = torch.randn(400, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 1e3
-    entries, offsets = intersect(*splats.geometry(), n_cameras=1, width=WIDTH, height=HEIGHT)
+    entries, offsets = intersect(*splats.geometry(), **GRID)
     for tile in range(len(offsets) - 1):
         depths = splats.depths[entries[offsets[tile] : offsets[tile + 1]].long()]
         assert (depths.diff() > 0).all()
@@ -108,7 +109,7 @@ def test_negative_and_float64_depths_keep_their_order():
 
 def test_tile_ranges_are_parts_of_the_whole():
     splats = random_splats(1500, WIDTH, HEIGHT, cameras=2)
-    options = {"n_cameras": 2, "width": WIDTH, "height": HEIGHT}
+    options = GRID | {"n_cameras": 2}
     entries, offsets = intersect(*splats.geometry(), **options)
     n_tiles = len(offsets) - 1
     for begin, end in [(0, 7), (7, 33), (33, 33), (33, n_tiles)]:
@@ -119,28 +120,20 @@ def test_tile_ranges_are_parts_of_the_whole():
 
 def test_does_not_depend_on_threads():
     splats = random_splats(5000, WIDTH, HEIGHT)
-    threads = torch.get_num_threads()
-    results = []
-    try:
-        for count in (1, 2, 3):
-            torch.set_num_threads(count)
-            results.append(intersect(*splats.geometry(), n_cameras=1, width=WIDTH, height=HEIGHT))
-    finally:
-        torch.set_num_threads(threads)
+    results = on_threads(lambda: intersect(*splats.geometry(), **GRID))
     assert all(torch.equal(a, b) for r in results[1:] for a, b in zip(results[0], r, strict=True))
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_capacity(device):
     splats = Splats(*(t.to(device) for t in vars(random_splats(100, WIDTH, HEIGHT)).values()))
-    options = {"n_cameras": 1, "width": WIDTH, "height": HEIGHT}
-    entries, offsets = intersect(*splats.geometry(), **options)
-    padded, same_offsets = intersect(*splats.geometry(), n_isects=len(entries) + 5, **options)
+    entries, offsets = intersect(*splats.geometry(), **GRID)
+    padded, same_offsets = intersect(*splats.geometry(), n_isects=len(entries) + 5, **GRID)
     assert len(padded) == len(entries) + 5
     assert torch.equal(padded[: len(entries)], entries)
     assert torch.equal(offsets, same_offsets)
     with pytest.raises(RuntimeError, match=f"n_isects is {len(entries) - 1} but there are {len(entries)}"):
-        intersect(*splats.geometry(), n_isects=len(entries) - 1, **options)
+        intersect(*splats.geometry(), n_isects=len(entries) - 1, **GRID)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
@@ -168,40 +161,30 @@ def test_a_conic_rounded_to_a_stripe_covers_its_line():
 
 def test_empty_and_one_splat():
     empty = random_splats(0, WIDTH, HEIGHT)
-    entries, offsets = intersect(*empty.geometry(), n_cameras=2, width=WIDTH, height=HEIGHT)
+    entries, offsets = intersect(*empty.geometry(), **GRID | {"n_cameras": 2})
     assert entries.shape == (0,)
     assert offsets.shape == (2 * 6 * 5 + 1,)
     assert not offsets.any()
     one = random_splats(1, WIDTH, HEIGHT)
     one.means2d[0] = torch.tensor([40.0, 40.0])
     one.opacities[0] = 0.5
-    entries, offsets = intersect(*one.geometry(), n_cameras=1, width=WIDTH, height=HEIGHT)
+    entries, offsets = intersect(*one.geometry(), **GRID)
     assert len(entries) >= 1
     assert not entries.any()
 
 
 def test_errors_name_the_value_of_intersect():
     splats = random_splats(3, WIDTH, HEIGHT)
-    options = {"n_cameras": 1, "width": WIDTH, "height": HEIGHT}
     with pytest.raises(RuntimeError, match=r"conics must have shape \[3, 3\], got \[3, 2\]"):
-        intersect(splats.means2d, splats.conics[:, :2], *splats.geometry()[2:], **options)
+        intersect(splats.means2d, splats.conics[:, :2], *splats.geometry()[2:], **GRID)
     with pytest.raises(RuntimeError, match="camera_ids must be Int"):
-        intersect(*splats.geometry()[:4], splats.camera_ids.long(), **options)
+        intersect(*splats.geometry()[:4], splats.camera_ids.long(), **GRID)
     with pytest.raises(RuntimeError, match=r"range of the 30 tiles, got \[5, 31\)"):
-        intersect(*splats.geometry(), tile_begin=5, tile_end=31, **options)
+        intersect(*splats.geometry(), tile_begin=5, tile_end=31, **GRID)
     with pytest.raises(RuntimeError, match=r"tile_size must be in \[1, 64\], got 0"):
         torch.ops.blitzgs.intersect(*splats.geometry(), None, 1, WIDTH, HEIGHT, 0, 0, -1, -1)
     with pytest.raises(RuntimeError, match="tile numbers are 32-bit, got 4294967296 tiles"):
         intersect(*splats.geometry(), n_cameras=1, width=2**20, height=2**20)
-
-
-@pytest.mark.parametrize("known", [False, True])
-def test_opcheck_of_intersect(known):
-    splats = random_splats(20, WIDTH, HEIGHT)
-    n_isects = len(intersect(*splats.geometry(), n_cameras=1, width=WIDTH, height=HEIGHT)[0]) if known else -1
-    torch.library.opcheck(
-        torch.ops.blitzgs.intersect, (*splats.geometry(), None, 1, WIDTH, HEIGHT, 16, 0, -1, n_isects)
-    )
 
 
 VIEW = (1, WIDTH, HEIGHT, 16)
@@ -232,7 +215,7 @@ def empty_room(device, number):
 def test_lists_ignore_entries_after_the_last_splat(n, with_ids, device):
     columns = Columns(n, 40_000, device, cameras=2)
     ids, padded_ids = (columns.ids, columns.padded_ids) if with_ids else (None, None)
-    view = {"n_cameras": 2, "width": WIDTH, "height": HEIGHT}
+    view = GRID | {"n_cameras": 2}
     expected, offsets = intersect(*columns.alone.geometry(), ids, **view)
     for capacity in (-1, len(expected), len(expected) + 30_000):
         found, found_offsets = intersect(
@@ -352,18 +335,17 @@ def test_lists_with_too_little_room_are_an_error(device):
 @pytest.mark.parametrize("device", DEVICES)
 def test_errors_name_the_value_of_splat_count(device):
     columns = Columns(100, 150, device)
-    view = {"n_cameras": 1, "width": WIDTH, "height": HEIGHT}
     with pytest.raises(RuntimeError, match="n_splats must be Long, got Int"):
-        intersect(*columns.padded.geometry(), **view, n_splats=columns.count.int())
+        intersect(*columns.padded.geometry(), **GRID, n_splats=columns.count.int())
     with pytest.raises(RuntimeError, match=r"n_splats must have shape \[1\], got \[2\]"):
-        intersect(*columns.padded.geometry(), **view, n_splats=columns.count.repeat(2))
-    lists = intersect(*columns.alone.geometry(), **view)
+        intersect(*columns.padded.geometry(), **GRID, n_splats=columns.count.repeat(2))
+    lists = intersect(*columns.alone.geometry(), **GRID)
     image = ops.rasterize_fwd(*columns.alone.values(), None, *lists, *VIEW, 0, -1)
     arguments = (columns.padded.values(), None, lists, kept_by(image), image[0], None, *VIEW, 0, -1)
     refused(RuntimeError, "150 splats .* got 100 and 30", ops.rasterize_bwd, *arguments, False, True)
     if device == "cuda":
         with pytest.raises(RuntimeError, match="n_splats must be on the device of the splats"):
-            intersect(*columns.padded.geometry(), **view, n_splats=columns.count.cpu())
+            intersect(*columns.padded.geometry(), **GRID, n_splats=columns.count.cpu())
         with pytest.raises(RuntimeError, match="gradients must have 150 splats or more, got 149"):
             ops.rasterize_fwd_(
                 *columns.padded.values(), None, *lists, *VIEW, 0, -1,
@@ -372,12 +354,13 @@ def test_errors_name_the_value_of_splat_count(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_opcheck_of_splat_count(device):
+def test_opcheck(device):
     columns = Columns(20, 30, device)
-    arguments = (*columns.padded.geometry(), None, *VIEW, 0, -1)
-    torch.library.opcheck(ops.intersect, (*arguments, -1, columns.count))
-    lists = ops.intersect(*columns.alone.geometry(), None, *VIEW, 0, -1, -1)
-    torch.library.opcheck(ops.intersect, (*arguments, len(lists[0]), columns.count))
+    alone, padded = ((*s.geometry(), None, *VIEW, 0, -1) for s in (columns.alone, columns.padded))
+    lists = ops.intersect(*alone, -1)
+    for capacity in (-1, len(lists[0])):
+        torch.library.opcheck(ops.intersect, (*alone, capacity))
+        torch.library.opcheck(ops.intersect, (*padded, capacity, columns.count))
     values = [t.requires_grad_() for t in columns.padded.values()]
     torch.library.opcheck(
         ops.rasterize_fwd,

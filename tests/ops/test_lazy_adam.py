@@ -21,39 +21,22 @@ def shapes(n, k=COEFFICIENTS):
     return [(n, 3), (n, 4), (n, 3), (n,), (n, k, 3)]
 
 
-class State:
-    def __init__(self, n, dtype, device="cpu", k=COEFFICIENTS, seed=0):
-        generator = torch.Generator().manual_seed(seed)
-        make = lambda s: torch.randn(s, generator=generator, dtype=torch.float64).to(device, dtype)  # noqa: E731
-        self.params = [make(s) for s in shapes(n, k)]
-        self.exp_avgs = [torch.zeros_like(p) for p in self.params]
-        self.exp_avg_sqs = [torch.zeros_like(p) for p in self.params]
-        self.last_step = torch.zeros(n, dtype=torch.int32, device=device)
-        self.moment_step = torch.zeros_like(self.last_step)
+def new_state(n, dtype, device="cpu", k=COEFFICIENTS):
+    """Random parameters with moments of zero."""
+    generator = torch.Generator().manual_seed(0)
+    normal = (torch.randn(s, generator=generator, dtype=torch.float64) for s in shapes(n, k))
+    params = [values.to(device, dtype) for values in normal]
+    moments = ([torch.zeros_like(p) for p in params] for _ in range(2))
+    return AdamState(params, *moments, *(torch.zeros(n, dtype=torch.int32, device=device) for _ in range(2)))
 
-    def moments(self):
-        return self.exp_avgs, self.exp_avg_sqs
 
-    def state(self):
-        return AdamState(self.params, *self.moments(), self.last_step, self.moment_step)
-
-    def tensors(self):
-        return self.state().tensors
-
-    def step(self, grads, ids, schedule, step):
-        lazy_adam_step_(self.state(), schedule, step, grads, ids)
-
-    def catch_up(self, ids, schedule, step):
-        lazy_adam_catch_up_(self.state(), schedule, step, ids)
-
-    def moments_at(self, step):
-        """Return both moments with their pending decay up to `step`, float64."""
-        gaps = (step - self.moment_step).double()
-        return [
-            [(m.double().flatten(1).T * beta**gaps).T.reshape(m.shape) if m.dim() > 1 else m * beta**gaps
-             for m in moments]
-            for beta, moments in ((BETA1, self.exp_avgs), (BETA2, self.exp_avg_sqs))
-        ]  # fmt: skip
+def moments_at(state, step):
+    """Return both moments with their pending decay up to `step`, float64."""
+    gaps = (step - state.moment_step).double()
+    return [
+        [m.double() * (beta**gaps).view(-1, *[1] * (m.dim() - 1)) for m in moments]
+        for beta, moments in ((BETA1, state.exp_avgs), (BETA2, state.exp_avg_sqs))
+    ]
 
 
 def schedule_of(steps, dtype, device="cpu"):
@@ -111,7 +94,7 @@ def random_step(n, dtype, generator, k=COEFFICIENTS):
 def test_equals_dense_adam_over_thousands_of_steps(dtype):
     steps, n = 2000, 60
     schedule = schedule_of(steps, dtype)
-    state = State(n, dtype)
+    state = new_state(n, dtype)
     rates = schedule.lr_table
     exact = DenseAdam(state.params, rates)
     rounded = DenseAdam(state.params, rates, dtype) if dtype == torch.float32 else exact
@@ -119,14 +102,14 @@ def test_equals_dense_adam_over_thousands_of_steps(dtype):
     generator = torch.Generator().manual_seed(3)
     for step in range(1, steps + 1):
         ids, grads = random_step(n, dtype, generator)
-        state.step(grads, ids, schedule, step)
+        lazy_adam_step_(state, schedule, step, grads, ids)
         exact.step(grads, ids, step)
         if rounded is not exact:
             rounded.step(grads, ids, step)
         if step == steps // 2:
-            state.catch_up(None, schedule, step)
+            lazy_adam_catch_up_(state, schedule, step)
     assert int(state.last_step.min()) < steps  # rows really were left behind
-    state.catch_up(None, schedule, steps)
+    lazy_adam_catch_up_(state, schedule, steps)
     assert bool((state.last_step == steps).all())
 
     columns = zip(state.params, exact.params(), rounded.params(), start, strict=True)
@@ -137,7 +120,7 @@ def test_equals_dense_adam_over_thousands_of_steps(dtype):
             assert error <= 1.5 * (dense32.double() - dense).abs().max()
         else:
             assert error < 1e-11
-    for ours, name in zip(state.moments_at(steps), ("exp_avg", "exp_avg_sq"), strict=True):
+    for ours, name in zip(moments_at(state, steps), ("exp_avg", "exp_avg_sq"), strict=True):
         for mine, dense in zip(ours, exact.moment(name), strict=True):
             tolerance = 1e-4 if dtype == torch.float32 else 1e-11
             largest = float(dense.abs().max())
@@ -147,36 +130,36 @@ def test_equals_dense_adam_over_thousands_of_steps(dtype):
 def one_update(n=7, dtype=torch.float64):
     """A state after one step of every row, and its schedule of 4000 steps."""
     schedule = schedule_of(4000, dtype)
-    state = State(n, dtype)
+    state = new_state(n, dtype)
     generator = torch.Generator().manual_seed(4)
     ids = torch.arange(n, dtype=torch.int32)
     grads = [torch.randn(s, generator=generator, dtype=torch.float64).to(dtype) for s in shapes(n)]
-    state.step(grads, ids, schedule, 1)
+    lazy_adam_step_(state, schedule, 1, grads, ids)
     return state, schedule
 
 
 def test_eps_is_exact_where_it_matters():
     """Gradients at and below eps take the explicit path and agree with dense Adam there too."""
     schedule = schedule_of(400, torch.float64)
-    state = State(40, torch.float64)
+    state = new_state(40, torch.float64)
     dense = DenseAdam(state.params, schedule.lr_table)
     ids = torch.arange(40, dtype=torch.int32)
     size = 10.0 ** torch.linspace(-18, -6, 40, dtype=torch.float64)
     grads = [size.reshape(-1, *[1] * (len(s) - 1)).expand(s).clone() for s in shapes(40)]
-    state.step(grads, ids, schedule, 1)
+    lazy_adam_step_(state, schedule, 1, grads, ids)
     dense.step(grads, ids, 1)
     none = torch.zeros(0, dtype=torch.int32)
     for step in range(2, 401):
         dense.step([torch.zeros((0, *s[1:]), dtype=torch.float64) for s in shapes(40)], none, step)
-    state.catch_up(None, schedule, 400)
+    lazy_adam_catch_up_(state, schedule, 400)
     torch.testing.assert_close(state.params, dense.params(), rtol=0, atol=1e-9)
 
 
 def scattered_state(n, dtype, step, device="cpu"):
     """Rows at `step` with second moments of 1e-40 to 1 and arbitrary first moments, some of them zero."""
-    state = State(n, dtype, device)
+    state = new_state(n, dtype, device)
     generator = torch.Generator().manual_seed(11)
-    for m, v in zip(*state.moments(), strict=True):
+    for m, v in zip(*state[1:3], strict=True):
         root = 10.0 ** (20 * torch.rand(v.shape, generator=generator, dtype=torch.float64) - 20)
         share = torch.randn(v.shape, generator=generator, dtype=torch.float64)
         share[torch.rand(v.shape, generator=generator) < 0.1] = 0
@@ -191,7 +174,7 @@ def drift_one_by_one(state, lr_table, begin, end):
     """Return what dense Adam subtracts from the parameters over steps without a gradient, float64."""
     rates = lr_table.double().cpu()
     drifts = []
-    for c, (m, v) in enumerate(zip(*([y.double().cpu() for y in x] for x in state.moments()), strict=True)):
+    for c, (m, v) in enumerate(zip(*([y.double().cpu() for y in x] for x in state[1:3]), strict=True)):
         root, drift = v.sqrt(), torch.zeros_like(m)
         for t in range(begin + 1, end + 1):
             j = t - begin
@@ -213,7 +196,7 @@ def test_float32_drift_of_any_second_moment(begin, gap, device):
     state = scattered_state(200, torch.float32, begin, device)
     for p in state.params:
         p.zero_()  # so that the parameter is the drift, unrounded
-    state.catch_up(None, schedule, begin + gap)
+    lazy_adam_catch_up_(state, schedule, begin + gap)
     for ours, exact in zip(
         state.params, drift_one_by_one(state, schedule.lr_table, begin, begin + gap), strict=True
     ):
@@ -233,8 +216,8 @@ def test_catching_up_in_parts_is_catching_up_at_once(dtype):
     for p in (*once.params, *parts.params):
         p.zero_()
     for step in (901, 902, 917, 940, 1300, 3000):
-        parts.catch_up(None, schedule, step)
-    once.catch_up(None, schedule, 3000)
+        lazy_adam_catch_up_(parts, schedule, step)
+    lazy_adam_catch_up_(once, schedule, 3000)
     torch.testing.assert_close(once.params, parts.params, rtol=tolerance, atol=1e-37)
     for before, after in zip(moments, (*parts.exp_avgs, *parts.exp_avg_sqs), strict=True):
         assert torch.equal(before, after)
@@ -248,9 +231,9 @@ def test_a_step_after_catching_up_equals_a_step_alone():
     grads = [
         torch.randn(s, generator=torch.Generator().manual_seed(2), dtype=torch.float64) for s in shapes(40)
     ]
-    a.catch_up(ids, schedule, 533)
+    lazy_adam_catch_up_(a, schedule, 533, ids)
     for state in (a, b):
-        state.step(grads, ids, schedule, 541)
+        lazy_adam_step_(state, schedule, 541, grads, ids)
         assert bool((state.last_step == 541).all()) and bool((state.moment_step == 541).all())
     for x, y in zip((*a.exp_avgs, *a.exp_avg_sqs), (*b.exp_avgs, *b.exp_avg_sqs), strict=True):
         assert torch.equal(x, y)
@@ -266,9 +249,9 @@ def test_final_rules_replace_many_pending_steps(gap, dtype):
     for begin in (1, 40, 900, 2000):
         state, alone = (scattered_state(40, dtype, begin) for _ in range(2))
         end = begin + reach + gap
-        state.catch_up(None, schedule, end)
+        lazy_adam_catch_up_(state, schedule, end)
         torch.ops.blitzgs.lazy_adam_catch_up_(
-            alone.tensors(), schedule.tables[:2], *schedule.constants(end), None
+            alone.tensors, schedule.tables[:2], *schedule.constants(end), None
         )
         torch.testing.assert_close(state.params, alone.params, rtol=0, atol=0)
 
@@ -286,7 +269,8 @@ def test_a_schedule_makes_its_tables_once(steps, dtype):
 
 def test_a_schedule_of_another_dtype_is_refused():
     state, _ = one_update(dtype=torch.float64)
-    refused(RuntimeError, "rules must have shape", state.catch_up, None, schedule_of(4000, torch.float32), 5)
+    schedule = schedule_of(4000, torch.float32)
+    refused(RuntimeError, "rules must have shape", lazy_adam_catch_up_, state, schedule, 5)
 
 
 @pytest.mark.cuda
@@ -296,10 +280,10 @@ def test_catching_up_needs_no_more_memory_late_in_a_schedule():
     peaks = []
     for step in (300, 30_000, 100_000):
         state = scattered_state(64, torch.float32, 200, "cuda")
-        state.catch_up(None, schedule, 201)
+        lazy_adam_catch_up_(state, schedule, 201)
         before = torch.cuda.memory_allocated()
         torch.cuda.reset_peak_memory_stats()
-        state.catch_up(None, schedule, step)
+        lazy_adam_catch_up_(state, schedule, step)
         peaks.append(torch.cuda.max_memory_allocated() - before)
     assert peaks[0] == peaks[1] == peaks[2]
 
@@ -310,8 +294,8 @@ def test_order_of_the_list_does_not_matter():
     ids = torch.arange(0, 50, 2, dtype=torch.int32)
     order = torch.randperm(25, generator=torch.Generator().manual_seed(5))
     grads = [torch.randn(s, generator=torch.Generator().manual_seed(6)) for s in shapes(25)]
-    a.step(grads, ids, schedule, 90)
-    b.step([g[order] for g in grads], ids[order], schedule, 90)
+    lazy_adam_step_(a, schedule, 90, grads, ids)
+    lazy_adam_step_(b, schedule, 90, [g[order] for g in grads], ids[order])
     for x, y in zip(
         [*a.params, *a.exp_avgs, *a.exp_avg_sqs], [*b.params, *b.exp_avgs, *b.exp_avg_sqs], strict=True
     ):
@@ -321,18 +305,14 @@ def test_order_of_the_list_does_not_matter():
 def test_empty_list_and_zero_gradient():
     state, schedule = one_update()
     before = [p.clone() for p in state.params]
-    state.step(
-        [torch.zeros((0, *s[1:]), dtype=torch.float64) for s in shapes(0)],
-        torch.zeros(0, dtype=torch.int32),
-        schedule,
-        2,
-    )
-    state.catch_up(None, schedule, 1)
+    nothing = [torch.zeros(s, dtype=torch.float64) for s in shapes(0)]
+    lazy_adam_step_(state, schedule, 2, nothing, torch.zeros(0, dtype=torch.int32))
+    lazy_adam_catch_up_(state, schedule, 1)
     torch.testing.assert_close(state.params, before, rtol=0, atol=0)
-    fresh = State(3, torch.float32)
+    fresh = new_state(3, torch.float32)
     still = [p.clone() for p in fresh.params]
     schedule = schedule_of(4000, torch.float32)
-    fresh.step([torch.zeros(s) for s in shapes(3)], torch.arange(3, dtype=torch.int32), schedule, 10)
+    lazy_adam_step_(fresh, schedule, 10, [torch.zeros(s) for s in shapes(3)], None)
     torch.testing.assert_close(fresh.params, still, rtol=0, atol=0)
 
 
@@ -342,12 +322,12 @@ def test_errors_name_the_value():
     with pytest.raises(
         RuntimeError, match="step 9999 is outside the learning-rate table, which ends at step 4000"
     ):
-        state.catch_up(None, schedule, 9999)
+        lazy_adam_catch_up_(state, schedule, 9999)
     bad = [torch.zeros(s, dtype=torch.float64) for s in shapes(2)]
     with pytest.raises(
         RuntimeError, match=r"the gradient of means must have 1 rows of 3 values, got \[2, 3\]"
     ):
-        state.step(bad, torch.zeros(1, dtype=torch.int32), schedule, 2)
+        lazy_adam_step_(state, schedule, 2, bad, torch.zeros(1, dtype=torch.int32))
 
 
 def test_opcheck():
@@ -355,7 +335,7 @@ def test_opcheck():
     tables, reach = schedule.tables, schedule.explicit_steps
     grads = [torch.randn(s) for s in shapes(2)]
     ids = torch.tensor([1, 3], dtype=torch.int32)
-    columns = state.tensors()
+    columns = state.tensors
     torch.library.opcheck(
         torch.ops.blitzgs.lazy_adam_step_, (columns, tables, *schedule.constants(2), grads, ids)
     )
@@ -373,14 +353,14 @@ def test_opcheck():
 @pytest.mark.parametrize("k", [1, 4, 9, 16])
 def test_cuda_equals_cpu(k):
     schedules = {device: schedule_of(300, torch.float32, device) for device in ("cpu", "cuda")}
-    states = {device: State(1000, torch.float32, device, k) for device in schedules}
+    states = {device: new_state(1000, torch.float32, device, k) for device in schedules}
     generator = torch.Generator().manual_seed(8)
     for step in range(1, 301):
         ids, grads = random_step(1000, torch.float32, generator, k)
         for device, state in states.items():
-            state.step([g.to(device) for g in grads], ids.to(device), schedules[device], step)
+            lazy_adam_step_(state, schedules[device], step, [g.to(device) for g in grads], ids.to(device))
     for device, state in states.items():
-        state.catch_up(None, schedules[device], 300)
+        lazy_adam_catch_up_(state, schedules[device], 300)
     for name in ("params", "exp_avgs", "exp_avg_sqs"):
         for a, b in zip(getattr(states["cpu"], name), getattr(states["cuda"], name), strict=True):
             torch.testing.assert_close(a, b.cpu(), rtol=1e-5, atol=1e-6 * float(a.abs().max()))
@@ -391,8 +371,8 @@ def test_cuda_equals_cpu(k):
 @needs_cuda
 @pytest.mark.parametrize("column", [1, 4])
 def test_cuda_refuses_what_begins_within_16_bytes(column):
-    state = State(8, torch.float32, "cuda", k=16)
+    state = new_state(8, torch.float32, "cuda", k=16)
     moment = state.exp_avgs[column]
     state.exp_avgs[column] = moment.new_zeros(moment.numel() + 1)[1:].view(moment.shape)
     with pytest.raises(RuntimeError, match="must be 16-byte aligned on CUDA"):
-        state.catch_up(None, schedule_of(10, torch.float32, "cuda"), 5)
+        lazy_adam_catch_up_(state, schedule_of(10, torch.float32, "cuda"), 5)

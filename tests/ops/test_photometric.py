@@ -10,7 +10,7 @@ from blitzgs.ops.photometric import (
     pixel_counts,
     ssim,
 )
-from tests.helpers import DEVICES, refused, ssim_map, sum_parts
+from tests.helpers import DEVICES, on_threads, refused, ssim_map, sum_parts
 
 
 def reference_sums(x, y, masks=None):
@@ -161,14 +161,7 @@ def test_equal_images_have_ssim_one_and_no_gradient(device):
 def test_threads_do_not_change_the_result():
     x, targets, masks = images((2, 200, 90))
     weights = torch.ones(2)
-    threads = torch.get_num_threads()
-    try:
-        torch.set_num_threads(1)
-        one = photometric_fwd_bwd(x, targets, masks, weights, weights)
-        torch.set_num_threads(3)
-        three = photometric_fwd_bwd(x, targets, masks, weights, weights)
-    finally:
-        torch.set_num_threads(threads)
+    one, three = on_threads(lambda: photometric_fwd_bwd(x, targets, masks, weights, weights), (1, 3))
     assert all(torch.equal(a, b) for a, b in zip(one, three, strict=True))
 
 

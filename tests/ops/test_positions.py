@@ -8,6 +8,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+import blitzgs
 from blitzgs.ops.counter_random import hash_keys, normal, uniform
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.population import position_noise_, voxel_keys
@@ -43,9 +44,9 @@ def test_knn_distances_match_a_kd_tree(device, k, kind):
 def test_knn_distances_in_float64_are_exact():
     points = cloud("clusters and outliers", 500)
     expected = cKDTree(points).query(points, 4)[0][:, 1:]
-    torch.testing.assert_close(
-        knn_distances(torch.from_numpy(points), 3), torch.from_numpy(expected), rtol=1e-14, atol=0
-    )
+    for function in (knn_distances, blitzgs.knn):
+        found = function(torch.from_numpy(points), 3)
+        torch.testing.assert_close(found, torch.from_numpy(expected), rtol=1e-14, atol=0)
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -11,7 +11,8 @@ from blitzgs.ops.intersect import intersect, tile_counts
 from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.ops.splat_gradients import GradientBuffer, gradient_columns, gradient_table_of
-from tests.ops.splats import Splats, dense_composite, kept_by, near_a_cut, random_splats
+from tests.helpers import on_threads
+from tests.ops.splats import Splats, by_definition, kept_by, random_splats
 from tests.ops.test_photometric import images
 
 WIDTH, HEIGHT = 53, 37  # neither is a multiple of a tile
@@ -33,11 +34,11 @@ def forward(splats, n_cameras=1, tile_size=16, backgrounds=None, tile_begin=0, t
 
 
 def backward(
-    splats, outputs, v_renders, v_alphas=None, n_cameras=1, backgrounds=None, absgrad=True, tiles=(0, -1)
+    splats, outputs, v_renders, n_cameras=1, backgrounds=None, absgrad=True, tiles=(0, -1), tile_lists=None
 ):
     return torch.ops.blitzgs.rasterize_bwd(
-        splats.values(), backgrounds, lists(splats, n_cameras), kept_by(outputs), v_renders, v_alphas,
-        n_cameras, WIDTH, HEIGHT, 16, *tiles, absgrad, True,
+        splats.values(), backgrounds, tile_lists or lists(splats, n_cameras), kept_by(outputs), v_renders,
+        None, n_cameras, WIDTH, HEIGHT, 16, *tiles, absgrad, True,
     )  # fmt: skip
 
 
@@ -59,8 +60,6 @@ def test_image_and_gradients_match_the_definition(channels, dtype, image_error, 
     backgrounds = torch.rand(2, channels, generator=generator, dtype=torch.float64).to(dtype)
     v_renders = torch.randn(2, HEIGHT, WIDTH, channels, generator=generator, dtype=torch.float64)
     v_alphas = torch.randn(2, HEIGHT, WIDTH, generator=generator, dtype=torch.float64)
-    clear = ~near_a_cut(splats, WIDTH, HEIGHT)
-    v_renders, v_alphas = v_renders * clear[..., None], v_alphas * clear
     tile_lists = lists(splats, 2)
 
     def ours(values, background):
@@ -70,11 +69,13 @@ def test_image_and_gradients_match_the_definition(channels, dtype, image_error, 
 
     def dense(values, background):
         exact = Splats(*values, splats.depths.double(), splats.camera_ids)
-        return dense_composite(exact, WIDTH, HEIGHT, 2, background)
+        return by_definition(exact, WIDTH, HEIGHT, 2, background)[:2]
 
     exact = splats.to(torch.float64)
     renders, alphas = ours(splats.values(), backgrounds)
-    true_renders, true_alphas = dense(exact.values(), backgrounds.double())
+    true_renders, true_alphas, cut = by_definition(exact, WIDTH, HEIGHT, 2, backgrounds.double())
+    clear = ~cut
+    v_renders, v_alphas = v_renders * clear[..., None], v_alphas * clear
     assert clear.float().mean() > 0.95
     assert ((renders - true_renders).abs() * clear[..., None]).max() < image_error
     assert ((alphas - true_alphas).abs() * clear).max() < image_error
@@ -88,8 +89,7 @@ def test_gradcheck():
     """Of the colours and, alone, of the opacity of an image."""
     splats = random_splats(8, 9, 8, channels=2, dtype=torch.float64, smallest=2, opacity=(0.1, 0.9), seed=4)
     tile_lists = lists(splats, width=9, height=8)
-    backgrounds = torch.rand(1, 2, dtype=torch.float64)
-    leaves = [t.requires_grad_() for t in (*splats.values(), backgrounds)]
+    leaves = [t.requires_grad_() for t in (*splats.values(), torch.rand(1, 2, dtype=torch.float64))]
 
     def image(*values):
         return rasterize(*values[:4], *tile_lists, n_cameras=1, width=9, height=8, backgrounds=values[4])
@@ -163,7 +163,7 @@ def test_tile_ranges_make_up_the_whole_image_bit_for_bit():
     backgrounds = torch.rand(2, 3, generator=torch.Generator().manual_seed(0))
     v_renders = torch.randn(2, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1))
     whole = forward(splats, 2, backgrounds=backgrounds)
-    v_whole = backward(splats, whole, v_renders, None, 2, backgrounds)
+    v_whole = backward(splats, whole, v_renders, 2, backgrounds)
     pieces = [
         forward(splats, 2, backgrounds=backgrounds, tile_begin=a, tile_end=b)
         for a, b in [(0, 5), (5, 17), (17, 24)]
@@ -176,7 +176,7 @@ def test_tile_ranges_make_up_the_whole_image_bit_for_bit():
         assert not piece[0][unowned].any()
         assert not piece[2][unowned].any()
     v_parts = [
-        backward(splats, whole, v_renders, None, 2, backgrounds, tiles=t) for t in [(0, 5), (5, 17), (17, 24)]
+        backward(splats, whole, v_renders, 2, backgrounds, tiles=t) for t in [(0, 5), (5, 17), (17, 24)]
     ]
     for parts, total in zip(zip(*v_parts, strict=True), v_whole, strict=True):
         torch.testing.assert_close(sum(parts), total, rtol=1e-4, atol=1e-4 * float(total.abs().max()))
@@ -195,15 +195,12 @@ def test_public_function_masks_unowned_alphas():
 def test_batch_position_and_threads_change_no_bit():
     splats = random_splats(1200, WIDTH, HEIGHT, cameras=3)
     v_renders = torch.randn(3, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1))
-    threads = torch.get_num_threads()
-    results = []
-    try:
-        for count in (1, 2, 3):
-            torch.set_num_threads(count)
-            outputs = forward(splats, 3)
-            results.append((*outputs[:4], *backward(splats, outputs, v_renders, n_cameras=3)))
-    finally:
-        torch.set_num_threads(threads)
+
+    def images_and_gradients():
+        outputs = forward(splats, 3)
+        return *outputs[:4], *backward(splats, outputs, v_renders, n_cameras=3)
+
+    results = on_threads(images_and_gradients)
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
     single = splats.camera_ids == 1
@@ -214,15 +211,6 @@ def test_batch_position_and_threads_change_no_bit():
     v_alone = backward(alone, outputs, v_renders[1:2])
     for a, b in zip(v_alone, results[0][4:], strict=True):
         assert torch.equal(a, b[single])
-
-
-@pytest.mark.parametrize("tile_size", [5, 8, 32, 64])
-def test_tile_size_only_moves_roundings_of_the_gradient(tile_size):
-    splats = random_splats(500, WIDTH, HEIGHT)
-    outputs = forward(splats)
-    other = forward(splats, tile_size=tile_size)
-    assert torch.equal(outputs[0], other[0])
-    assert torch.equal(outputs[1], other[1])
 
 
 SCALAR_SCRIPT = """
@@ -285,15 +273,8 @@ def test_a_splat_that_is_not_finite_leaves_the_others_alone():
             *broken.values(), None, *tile_lists, 1, WIDTH, HEIGHT, 16, 0, -1
         )
         assert torch.equal(found[0], expected[0])
-        outputs = backward_with(broken, tile_lists, found)
-        assert all(torch.isfinite(t).all() for t in outputs)
-
-
-def backward_with(splats, tile_lists, outputs):
-    return torch.ops.blitzgs.rasterize_bwd(
-        splats.values(), None, tile_lists, kept_by(outputs), torch.ones_like(outputs[0]), None,
-        1, WIDTH, HEIGHT, 16, 0, -1, True, True,
-    )  # fmt: skip
+        gradients = backward(broken, found, torch.ones_like(found[0]), tile_lists=tile_lists)
+        assert all(torch.isfinite(t).all() for t in gradients)
 
 
 def test_errors_name_the_value():

@@ -16,12 +16,18 @@ from tests.helpers import BACKENDS, DEVICES, needs_cuda, random_scene, refused
 from tests.ops.test_importance import crowded, lists_of
 
 
-def scene_of(device="cpu", dtype=torch.float32, cameras=4):
+def tables_of(device="cpu", dtype=torch.float32, cameras=4, degree=3):
+    """The inputs of a projection without SH, and the SH."""
     scene = random_scene(n=90, cameras=cameras, width=24, height=20, dtype=dtype, device=device)
     scene.opacities[::3] = 0  # seen by no view
     scene.colors[1::7] = torch.nan
     geometry = [scene.means, scene.quats, scene.scales, scene.opacities]
-    return geometry, scene.colors, (scene.viewmats, scene.Ks)
+    options = ProjectionOptions(24, 20, sh_degree=degree or 0, raw=False)
+    return ProjectionInputs(geometry, (scene.viewmats, scene.Ks), options), scene.colors
+
+
+def with_sh(tables, sh):
+    return tables._replace(gaussians=[*tables.gaussians, sh])
 
 
 def render_rows(splats, tables, parts, totals=None, with_depth=False):
@@ -53,18 +59,16 @@ def require_equal(found, expected):
 @pytest.mark.parametrize("degree", [None, 0, 1, 2, 3])
 @pytest.mark.parametrize("lengths", [(16,), (1, 15)])
 def test_splats_are_those_of_a_projection_with_sh(backend, cameras, degree, lengths):
-    geometry, sh, views = scene_of(*backend, cameras)
-    options = ProjectionOptions(24, 20, sh_degree=degree or 0, raw=False)
+    tables, sh = tables_of(*backend, cameras, degree)
     parts = () if degree is None else sh.split(lengths, dim=1)
-    tables = ProjectionInputs(geometry, views, options)
+    whole = with_sh(tables, sh) if parts else tables
     found, (rows, numbers, indices) = colored_rows(project_splats(tables), tables, parts)
-    expected = project_splats(tables._replace(gaussians=[*geometry, *([sh] if parts else [])]))
+    expected = project_splats(whole)
     assert 0 < len(expected.visible_ids) < 90 and (degree is None or not expected.opacities.all())
     require_equal(found, expected)
     assert torch.equal(indices, expected.visible_ids.long())
     assert torch.equal(numbers, torch.arange(len(expected.visible_ids), device=backend[0]))
-    wanted = [*geometry, *([sh] if parts else [])]
-    for own, table in zip(rows, wanted, strict=True):
+    for own, table in zip(rows, whole.gaussians, strict=True):
         gathered = table[expected.visible_ids.long()]
         assert torch.equal(own.nan_to_num(), gathered.nan_to_num()) and own.is_contiguous()
 
@@ -72,10 +76,9 @@ def test_splats_are_those_of_a_projection_with_sh(backend, cameras, degree, leng
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("with_depth", [False, True])
 def test_images_are_those_of_lists_and_compositing(backend, with_depth):
-    geometry, sh, views = scene_of(*backend)
-    tables = ProjectionInputs(geometry, views, ProjectionOptions(24, 20, sh_degree=3, raw=False))
+    tables, sh = tables_of(*backend)
     found = render_rows(project_splats(tables), tables, (sh,), with_depth=with_depth)
-    splats = project_splats(tables._replace(gaussians=[*geometry, sh]))
+    splats = project_splats(with_sh(tables, sh))
     columns, grid = (splats.means2d, splats.conics, splats.opacities), TileGrid(4, 24, 20)
     lists = torch.ops.blitzgs.intersect(*columns, splats.depths, splats.camera_ids, None, *grid, -1)
     channels = torch.cat([splats.colors, splats.depths[:, None]], 1) if with_depth else splats.colors
@@ -90,25 +93,22 @@ def test_images_are_those_of_lists_and_compositing(backend, with_depth):
 @pytest.mark.parametrize("cameras", [1, 4])
 @pytest.mark.parametrize("spare", [0, 1, 5000])
 def test_spare_capacity_changes_nothing(cameras, spare):
-    geometry, sh, views = scene_of("cuda", cameras=cameras)
-    options = ProjectionOptions(24, 20, sh_degree=3, raw=False)
-    tables = ProjectionInputs(geometry, views, options)
-    expected = project_splats(tables._replace(gaussians=[*geometry, sh]))
+    tables, sh = tables_of("cuda", cameras=cameras)
+    expected = project_splats(with_sh(tables, sh))
     sizes = tables.project(None).totals.cpu()[:3]
     capacity = Sizes(*(int(n) + spare for n in sizes))
     projected = tables.project(capacity)
     found, (rows, *_) = colored_rows(projected.splats, tables, (sh,), projected.totals)
     require_equal(splats_of(found, Sizes(*sizes.tolist())), expected)
     visible = expected.visible_ids.long()
-    assert torch.equal(rows[0][: len(visible)], geometry[0][visible])
+    assert torch.equal(rows[0][: len(visible)], tables.gaussians[0][visible])
 
 
 @pytest.mark.cuda
 @needs_cuda
 @pytest.mark.parametrize("missing", [(1, 0), (0, 1), (10, 10)])
 def test_too_little_capacity_writes_nothing_beyond_it(missing):
-    geometry, sh, views = scene_of("cuda")
-    tables = ProjectionInputs(geometry, views, ProjectionOptions(24, 20, sh_degree=3, raw=False))
+    tables, sh = tables_of("cuda")
     visible, splats, isects = tables.project(None).totals.cpu()[:3].tolist()
     projected = tables.project(Sizes(visible - missing[0], splats - missing[1], isects))
     colored_rows(projected.splats, tables, (sh,), projected.totals)
@@ -117,8 +117,7 @@ def test_too_little_capacity_writes_nothing_beyond_it(missing):
 
 
 def test_errors_name_the_argument():
-    geometry, sh, views = scene_of()
-    tables = ProjectionInputs(geometry, views, ProjectionOptions(24, 20, sh_degree=3, raw=False))
+    tables, sh = tables_of()
     splats = project_splats(tables)
     with pytest.raises(RuntimeError, match="render: camera_ids must be Int, got Long"):
         colored_rows(splats._replace(camera_ids=splats.camera_ids.long()), tables, (sh,))

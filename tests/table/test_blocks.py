@@ -118,9 +118,8 @@ def looking_down(device):
 
 def cull(index, table, views):
     """The active set of several cameras above the ground, as `BlockIndex.active` asks for it."""
-    return cull_blocks(
-        index.bounds, table["means"], table["scales"], *views, WIDTH, HEIGHT, NEAR, 100.0
-    ).listed()
+    rows = (index.bounds, table["means"], table["scales"])
+    return cull_blocks(*rows, Views(*views, WIDTH, HEIGHT), (NEAR, 100.0, 0.3)).listed()
 
 
 @pytest.mark.parametrize("device", DEVICES)

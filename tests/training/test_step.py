@@ -14,7 +14,7 @@ from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.render import RenderOptions, render_frame
-from blitzgs.frame.transport import stages_told_to
+from blitzgs.frame.transport.protocol import stages_told_to
 from blitzgs.ops.projection_types import Views
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import INITIAL_OPACITY

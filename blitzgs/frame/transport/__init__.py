@@ -6,22 +6,7 @@ from __future__ import annotations
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.transport.collective import CollectiveTransport
 from blitzgs.frame.transport.peer import PeerTransport
-from blitzgs.frame.transport.protocol import (
-    Arrived,
-    Exchange,
-    ExchangeResult,
-    LocalTransport,
-    Traffic,
-    Transport,
-    WayBack,
-    stage_ended,
-    stages_told_to,
-)
-
-__all__ = [
-    "Arrived", "CollectiveTransport", "Exchange", "ExchangeResult", "LocalTransport", "PeerTransport",
-    "Traffic", "Transport", "WayBack", "open_transport", "stage_ended", "stages_told_to",
-]  # fmt: skip
+from blitzgs.frame.transport.protocol import LocalTransport, Transport
 
 
 def open_transport(ranks: Ranks | None) -> Transport:

@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 import torch.distributed as dist
-from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport.protocol import (
     Arrived,
     CapacityEstimate,
+    Exchange,
     ExchangeResult,
     Traffic,
     WayBack,
@@ -38,21 +38,11 @@ class CollectiveTransport:
 
     def project_and_send(
         self, inputs: ProjectionInputs, assignment: TileAssignment | None, capacity: Sizes | None
-    ) -> CollectiveExchange:
+    ) -> Exchange:
         """See `Transport.project_and_send`."""
         if assignment is None:
             raise ValueError("several ranks need an assignment of tiles")
-        return CollectiveExchange(self._ranks, inputs, assignment, capacity)
-
-
-class CollectiveExchange:
-    """See `Exchange`."""
-
-    def __init__(
-        self, ranks: Ranks, inputs: ProjectionInputs, assignment: TileAssignment, capacity: Sizes | None
-    ) -> None:
-        """Project, exchange the numbers of splats, and send the splats."""
-        tiles, n_views = assignment.composited_by_rank, assignment.ranges.n_views
+        ranks, tiles, n_views = self._ranks, assignment.composited_by_rank, assignment.ranges.n_views
         # Without capacity the projection waits for the device, which may still wait for other ranks.
         with ranks.watchdog.waiting("project"):
             projected = inputs.project(capacity, tiles)
@@ -65,7 +55,7 @@ class CollectiveExchange:
             visible = everyone[:, VIEW_TOTALS : VIEW_TOTALS + n_views].sum(0)
             totals = to_host(everyone).tolist()
         traffic = Traffic.of(totals, n_views, ranks.rank)
-        self._needed = needed = traffic.own._replace(blocks=traffic.most_blocks)
+        needed = traffic.own._replace(blocks=traffic.most_blocks)
         if capacity is not None and not capacity.holds(needed[:2]):
             projected = inputs.project(None, tiles)  # no queued work waits for another rank now
         stage_ended("project")
@@ -79,16 +69,10 @@ class CollectiveExchange:
         means2d, depths, camera_ids, ids, conics, opacities, colors = gather_splats(
             arrived.view(-1), columns, traffic.received
         )
-        splats = Splats(means2d, conics, opacities, colors, depths, camera_ids, ids)
-        self.gradient_table: Tensor | None = None
-        self.arrived = Arrived(splats, None, traffic.n_isects)
-        self._result: ExchangeResult | None = None
+        splats, result = Splats(means2d, conics, opacities, colors, depths, camera_ids, ids), None
         # All ranks decide the same, because they have estimated the same number of blocks.
         if capacity is None or needed.blocks <= capacity.blocks:
             way_back = WayBack(ranks, traffic, places)
-            self._result = ExchangeResult(own, splats, visible, traffic, way_back)
+            result = ExchangeResult(own, splats, totals[ranks.rank], visible, way_back)
         stage_ended("exchange")
-
-    def finish(self) -> tuple[Sizes, ExchangeResult | None]:
-        """See `Exchange.finish`; the host has known all numbers since the splats were sent."""
-        return self._needed, self._result
+        return Exchange(projected, Arrived(splats, None, traffic.n_isects), None, lambda: (needed, result))

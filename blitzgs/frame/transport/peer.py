@@ -40,6 +40,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -50,6 +51,7 @@ from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport.protocol import (
     Arrived,
     CapacityEstimate,
+    Exchange,
     ExchangeResult,
     Traffic,
     WayBack,
@@ -125,80 +127,62 @@ class PeerTransport:
 
     def project_and_send(
         self, inputs: ProjectionInputs, assignment: TileAssignment | None, capacity: Sizes | None
-    ) -> PeerExchange:
+    ) -> Exchange:
         """See `Transport.project_and_send`."""
         if assignment is None:
             raise ValueError("several ranks need an assignment of tiles")
+        ranks, memory, counted, n_views = self._ranks, self._memory, self._counted, inputs.n_views
         if capacity is not None:
-            present = self._memory.buffers[0].shape[0]
+            present = memory.buffers[0].shape[0]
             words = room_for(capacity.splats, present)
             if words > present:
-                with self._ranks.watchdog.waiting("reserve"):
-                    self._memory.reserve(words)
-        if self._buffers is None or self._buffers.buffers[0] is not self._memory.buffers[0]:
-            self._buffers = PeerBuffers(self._memory.buffers, self._ranks.rank)
-        return PeerExchange(self._ranks, self._buffers, self._counted, inputs, assignment, capacity)
-
-
-class PeerExchange:
-    """See `Exchange`."""
-
-    def __init__(
-        self,
-        ranks: Ranks,
-        buffers: PeerBuffers,
-        counted: torch.cuda.Event,
-        inputs: ProjectionInputs,
-        assignment: TileAssignment,
-        capacity: Sizes | None,
-    ) -> None:
-        """Queue the projection and the writing of the splats; record `counted` behind the counts."""
-        assert ranks.memory is not None  # see `PeerTransport`
-        self._memory = memory = ranks.memory
-        self._ranks, self._buffers, self._counted, self._capacity = ranks, buffers, counted, capacity
-        self._n_views = inputs.n_views
-        self._traffic: Traffic | None = None
+                with ranks.watchdog.waiting("reserve"):
+                    memory.reserve(words)
+        if self._buffers is None or self._buffers.buffers[0] is not memory.buffers[0]:
+            self._buffers = PeerBuffers(memory.buffers, ranks.rank)
+        buffers = self._buffers
         room = Sizes(buffers.length, buffers.length, 0)
         projected = inputs.project(room, assignment.composited_by_rank)
-        self._own = projected.splats
-        self._shared = memory.share(projected.totals)  # barrier A
+        shared = memory.share(projected.totals)  # barrier A
         counted.record(current_stream(ranks.device))
-        self._places, plan = torch.ops.blitzgs.send_splats_(
-            list(projected.for_compositing), projected.splats.rank_masks, self._shared.everyone, ranks.rank,
+        places, plan = torch.ops.blitzgs.send_splats_(
+            list(projected.for_compositing), projected.splats.rank_masks, shared.everyone, ranks.rank,
             buffers.buffers, buffers.length,
         )  # fmt: skip
         memory.barrier()  # B
         memory.generation += 1
-        self._generation = memory.generation
+        generation = memory.generation
         stage_ended("project")
-        n_isects = self._read().n_isects if capacity is None else capacity.isects
-        self.arrived = Arrived(buffers.splats, plan[:1], n_isects)
-        self.gradient_table: Tensor | None = buffers.tables[ranks.rank]
+
+        @cache
+        def totals() -> list[list[int]]:
+            """Wait for the counts of all ranks."""
+            with ranks.watchdog.waiting("share_counts"):
+                counted.synchronize()
+            return shared.host.tolist()
+
+        def finish() -> tuple[Sizes, ExchangeResult | None]:
+            traffic = Traffic.of(totals(), n_views, ranks.rank)
+            fits = traffic.most <= buffers.length
+            if capacity is not None:
+                fits &= traffic.most_isects <= capacity.isects and traffic.most_blocks <= capacity.blocks
+            if not fits:
+                return traffic.needed, None
+            way_back = PeerWayBack(
+                ranks, traffic, places[: place_runs(traffic.own.splats)], memory, generation, buffers.tables
+            )
+            return traffic.needed, ExchangeResult(
+                projected=splats_of(projected.splats, traffic.own),
+                splats=buffers.splats.first(sum(traffic.received)),
+                totals=totals()[ranks.rank],
+                visible=shared.sums[VIEW_TOTALS : VIEW_TOTALS + n_views],
+                way_back=way_back,
+            )
+
+        n_isects = Traffic.of(totals(), n_views, ranks.rank).n_isects if capacity is None else capacity.isects
         stage_ended("exchange")
-
-    def finish(self) -> tuple[Sizes, ExchangeResult | None]:
-        """See `Exchange.finish`."""
-        traffic, capacity = self._read(), self._capacity
-        fits = traffic.most <= self._buffers.length
-        if capacity is not None:
-            fits = fits and traffic.most_isects <= capacity.isects and traffic.most_blocks <= capacity.blocks
-        if not fits:
-            return traffic.needed, None
-        visible = self._shared.sums[VIEW_TOTALS : VIEW_TOTALS + self._n_views]
-        composited = self._buffers.splats.first(sum(traffic.received))
-        places = self._places[: place_runs(traffic.own.splats)]
-        shared = self._memory, self._generation, self._buffers.tables
-        way_back = PeerWayBack(self._ranks, traffic, places, *shared)
-        own = splats_of(self._own, traffic.own)
-        return traffic.needed, ExchangeResult(own, composited, visible, traffic, way_back)
-
-    def _read(self) -> Traffic:
-        """Wait for the counts of all ranks."""
-        if self._traffic is None:
-            with self._ranks.watchdog.waiting("share_counts"):
-                self._counted.synchronize()
-            self._traffic = Traffic.of(self._shared.host.tolist(), self._n_views, self._ranks.rank)
-        return self._traffic
+        arrived = Arrived(buffers.splats, plan[:1], n_isects)
+        return Exchange(projected, arrived, buffers.tables[ranks.rank], finish)
 
 
 @dataclass(frozen=True)

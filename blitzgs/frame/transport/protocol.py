@@ -28,7 +28,14 @@ from torch import Tensor
 
 from blitzgs.ops.exchange import PLACE_SPLATS
 from blitzgs.ops.host import HostCopy
-from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectedSplats, ProjectionInputs, Sizes, Splats
+from blitzgs.ops.projection_types import (
+    VIEW_TOTALS,
+    ProjectedSplats,
+    ProjectionInputs,
+    ProjectionOutputs,
+    Sizes,
+    Splats,
+)
 
 if TYPE_CHECKING:
     from blitzgs.distributed.group import Ranks
@@ -110,25 +117,22 @@ class ExchangeResult(NamedTuple):
 
     projected: ProjectedSplats  # this rank's own splats, only valid ones
     splats: Splats  # the splats that this rank composites, only valid ones
+    totals: list[int]  # this rank's `ProjectionOutputs.totals`
     visible: Tensor  # int64 [B], splats of each view over all ranks; valid until the next exchange
-    traffic: Traffic | None  # numbers of splats sent between the ranks; None: there is one rank
     way_back: WayBack | None  # returns the gradients; None: there is one rank, which has them already
 
 
-class Exchange(Protocol):
+class Exchange(NamedTuple):
     """The exchange of one frame's splats: queued work, whose sizes the host may not know until `finish`."""
 
+    projected: ProjectionOutputs  # this rank's own splats, with spare capacity if the host does not know more
     arrived: Arrived  # the splats that this rank composites
     # Memory, [R, 12], in which the gradients of these splats must be added up, because other ranks read them
     # there; compositing must zero it. None: any memory can be used.
     gradient_table: Tensor | None
-
-    def finish(self) -> tuple[Sizes, ExchangeResult | None]:
-        """Wait for the numbers.
-
-        Returns the sizes that the frame needs, from which `Transport.estimate` learns; and the result, None
-        if the capacity was too small and the frame must be started again.
-        """
+    # Waits for the numbers. Returns the sizes that the frame needs, from which `Transport.estimate` learns;
+    # and the result, None if the capacity was too small and the frame must be started again.
+    finish: Callable[[], tuple[Sizes, ExchangeResult | None]]
 
 
 @dataclass(frozen=True)
@@ -244,47 +248,34 @@ class LocalTransport:
 
     def project_and_send(
         self, inputs: ProjectionInputs, assignment: TileAssignment | None, capacity: Sizes | None
-    ) -> LocalExchange:
+    ) -> Exchange:
         """See `Transport.project_and_send`."""
         if assignment is not None:
             raise ValueError("a local transport serves one rank, which composites all tiles")
-        return LocalExchange(inputs, capacity)
-
-
-class LocalExchange:
-    """See `Exchange`."""
-
-    def __init__(self, inputs: ProjectionInputs, capacity: Sizes | None) -> None:
-        """Project."""
-        # On the CPU the sizes are known at once, so no estimate is needed.
-        self._capacity = capacity if inputs.gaussians[0].is_cuda else None
-        # `arrived` has the columns of the projection that compositing reads.
-        self.projected = projected = inputs.project(self._capacity)
-        self.gradient_table: Tensor | None = None
-        splats, host = projected.for_compositing, projected.totals
-        self._copy = HostCopy(host) if host.is_cuda else None
-        self.totals: list[int] | None = None  # of `projected`; None until the host has waited for them
+        if not inputs.gaussians[0].is_cuda:
+            capacity = None  # on the CPU the sizes are known at once
+        projected = inputs.project(capacity)
+        splats, copy = projected.for_compositing, HostCopy(projected.totals)
         stage_ended("project")
-        if self._capacity is None:
-            self._host = host if self._copy is None else self._copy.read()
-            self.totals = self._host.tolist()
-            self.arrived = Arrived(splats, None, self.totals[2])
+        known: list[int] = [] if capacity is not None else copy.read().tolist()
+        if capacity is None:
+            arrived = Arrived(splats, None, known[2])
         else:
-            self.arrived = Arrived(splats, projected.n_splats, self._capacity.isects)
+            arrived = Arrived(splats, projected.n_splats, capacity.isects)
         stage_ended("exchange")
 
-    def finish(self) -> tuple[Sizes, ExchangeResult | None]:
-        """See `Exchange.finish`."""
-        if self.totals is None:
-            assert self._copy is not None
-            self._host = self._copy.read()
-            self.totals = self._host.tolist()
-        needed, projected = Sizes(*self.totals[:VIEW_TOTALS]), self.projected
-        if self._capacity is not None and not self._capacity.holds(needed):
-            return needed, None  # the splats are undefined
-        counts, visible = self._host[:3], projected.totals[VIEW_TOTALS:]
-        if self._capacity is None:
-            splats = projected.splats._replace(counts=counts)
-            return needed, ExchangeResult(splats, self.arrived.splats, visible, None, None)
-        own = projected.first(needed, counts)
-        return needed, ExchangeResult(own.splats, own.for_compositing, visible, None, None)
+        def finish() -> tuple[Sizes, ExchangeResult | None]:
+            on_host = copy.read()
+            totals = known or on_host.tolist()
+            needed, counts = Sizes(*totals[:VIEW_TOTALS]), on_host[:3]
+            if capacity is None:
+                own, composited = projected.splats._replace(counts=counts), splats
+            elif capacity.holds(needed):
+                valid = projected.first(needed, counts)
+                own, composited = valid.splats, valid.for_compositing
+            else:
+                return needed, None  # the splats are undefined
+            visible = projected.totals[VIEW_TOTALS:]
+            return needed, ExchangeResult(own, composited, totals, visible, None)
+
+        return Exchange(projected, arrived, None, finish)
