@@ -21,14 +21,13 @@ autograd then runs the backward pass in the loop's own thread.
 from __future__ import annotations
 
 import argparse
-import time
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import torch
-from harness import make_parser, report, synchronize
+from harness import make_parser, report, seconds_of
 from opponents.gsplat_training import GsplatOptions, GsplatTrainer
 from torch import Tensor
 
@@ -148,13 +147,9 @@ class Gsplat(OneImport):
 ARMS = {"gsplat": Gsplat, "import": OneImport, "four": FourSwaps}
 
 
-def seconds_of(trainer: GsplatTrainer, until: int) -> float:
-    """Continue the training and return the seconds it took."""
-    synchronize(trainer.device)
-    start = time.perf_counter()
-    trainer.train_to(until)
-    synchronize(trainer.device)
-    return time.perf_counter() - start
+def seconds_until(trainer: GsplatTrainer, step: int) -> float:
+    """Continue the training to a step; returns the seconds it took."""
+    return seconds_of(trainer.device, lambda: trainer.train_to(step))
 
 
 def seconds_by_kind(trainer: GsplatTrainer, until: int) -> tuple[float, float]:
@@ -164,8 +159,8 @@ def seconds_by_kind(trainer: GsplatTrainer, until: int) -> tuple[float, float]:
     """
     every, ordinary, around = trainer._strategy.refine_every, 0.0, 0.0
     while trainer.step < until:
-        ordinary += seconds_of(trainer, min(-(-trainer.step // every) * every, until))
-        around += seconds_of(trainer, min(trainer.step + 2, until))
+        ordinary += seconds_until(trainer, min(-(-trainer.step // every) * every, until))
+        around += seconds_until(trainer, min(trainer.step + 2, until))
     return ordinary, around
 
 
@@ -190,8 +185,8 @@ def measure(name: str, capture: Any, images: ImageStore, options: argparse.Names
     trainer = ARMS[name]("default", GsplatOptions.of("default", choices), capture, images, device, 0)
     last = min(99, options.steps // 10)  # between two densifications
     ordinary, changes = seconds_by_kind(trainer, options.steps - last)
-    rest = seconds_of(trainer, options.steps)
-    found = {
+    rest = seconds_until(trainer, options.steps)
+    return {
         "arm": name,
         "loss": trainer.loss_name,
         "training, s": ordinary + changes + rest,
@@ -200,7 +195,6 @@ def measure(name: str, capture: Any, images: ImageStore, options: argparse.Names
         "Gaussians": len(trainer.params["means"]),
         "PSNR, dB": psnr(trainer, capture, images),
     }
-    return found
 
 
 def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:

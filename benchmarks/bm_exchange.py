@@ -33,7 +33,7 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import torch
-from harness import Clock, make_parser, write_json
+from harness import Clock, make_parser, torchrun, write_json
 from report_tables import exchange_lines
 from scenes import aerial
 
@@ -246,10 +246,8 @@ def main() -> None:
         return
     reports = []
     for count in args.ranks:
-        torchrun = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}"]
-        done = subprocess.run(
-            [sys.executable, *torchrun, *sys.argv], stdout=subprocess.PIPE, text=True, check=True
-        )
+        command = [sys.executable, *torchrun(count), *sys.argv]
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
         line = next(text for text in done.stdout.splitlines() if text.startswith("REPORT "))
         reports.append(json.loads(line.removeprefix("REPORT ")))
         print("\n".join(exchange_lines({"results": reports})), flush=True)

@@ -39,13 +39,10 @@ WARM_UP = 2.0
 
 def synthetic(count: int, device: str) -> Opened:
     """Return the synthetic aerial scene as a model to show; trained units of 1 km."""
-    columns = {name: column.float() for name, column in aerial(count, device).raw().items()}
-    unit = 1024.0
-    columns["means"] = columns["means"] / unit
-    columns["scales"] = columns["scales"] - float(np.log(unit))
-    order = morton_order(columns["means"])
-    for name in list(columns):
-        columns[name] = columns[name][order]
+    scene, unit = aerial(count, device), 1024.0
+    columns = scene.rows(morton_order(scene.means)).raw()
+    columns["means"] /= unit
+    columns["scales"] -= float(np.log(unit))
     table = GaussianTable.of_parameters(columns)
     space = Space((0.0, 0.0, 0.0), unit, 1.0)
     options = render_options(Config(), space, 3)

@@ -128,7 +128,11 @@ def markdown_table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def make_parser(
-    description: str | None, *, device: str | None = BEST_DEVICE, repeats: int | None = None
+    description: str | None,
+    *,
+    device: str | None = BEST_DEVICE,
+    repeats: int | None = None,
+    writes_json: bool = True,
 ) -> argparse.ArgumentParser:
     """Return a parser of the options that benchmarks share.
 
@@ -136,6 +140,7 @@ def make_parser(
         description: the docstring of the benchmark, which --help prints as it is written.
         device: default of --device; None: the benchmark has no such option.
         repeats: default of --repeats; None: the benchmark has no such option.
+        writes_json: whether there is --json.
     """
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -144,7 +149,8 @@ def make_parser(
         parser.add_argument("--device", default=device)
     if repeats is not None:
         parser.add_argument("--repeats", type=int, default=repeats, help="timed runs (%(default)s)")
-    parser.add_argument("--json", type=Path, help="write the results, commit and machine to this file")
+    if writes_json:
+        parser.add_argument("--json", type=Path, help="write the results, commit and machine to this file")
     return parser
 
 
@@ -163,6 +169,20 @@ def synchronize(device: torch.device | str) -> None:
     """Wait for the GPU, if the device is one."""
     if torch.device(device).type == "cuda":
         torch.cuda.synchronize(device)
+
+
+def seconds_of(device: torch.device | str, call: Callable[[], object]) -> float:
+    """Return the seconds of a call by the host's clock, with the device idle before and after."""
+    synchronize(device)
+    begin = time.perf_counter()
+    call()
+    synchronize(device)
+    return time.perf_counter() - begin
+
+
+def torchrun(ranks: int) -> list[str]:
+    """Return the arguments of Python that run the script which follows them on so many ranks of this host."""
+    return ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"]
 
 
 def median_ms(
@@ -218,6 +238,27 @@ class Clock:
             (name, begin.elapsed_time(end) if self._cuda else 1000 * (end - begin))
             for (_, begin), (name, end) in zip(self._marks, self._marks[1:], strict=False)
         ]
+
+
+def stage_medians(
+    step: Callable[[Callable[[str], None]], object],
+    repeats: int,
+    prepare: Callable[[], object] = lambda: None,
+    warm_up: int = 5,
+) -> list[tuple[str, float]]:
+    """Return name and median milliseconds on CUDA of each stage, in order, last of the "total" of a step.
+
+    `step` gets a function, to be called with the name of each stage at its end. `prepare` is not timed.
+    """
+    samples = []
+    for _ in range(warm_up + repeats):
+        prepare()
+        clock = Clock()
+        step(clock.mark)
+        stages = clock.stages()
+        samples.append([*stages, ("total", sum(ms for _, ms in stages))])
+    columns = zip(*samples[warm_up:], strict=True)
+    return [(column[0][0], statistics.median(ms for _, ms in column)) for column in columns]
 
 
 def _flatten(value: Any) -> list[Any]:

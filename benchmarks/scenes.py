@@ -41,6 +41,11 @@ class BenchmarkScene:
             "opacities": torch.logit(self.opacities), "sh": self.sh,
         }  # fmt: skip
 
+    def rows(self, order: Tensor) -> BenchmarkScene:
+        """Return the scene with its Gaussians in another order, int64 [N]."""
+        names = ("means", "quats", "scales", "opacities", "sh")
+        return replace(self, **{name: getattr(self, name)[order] for name in names})
+
     def first_views(self, count: int) -> BenchmarkScene:
         """Return the scene seen by its first `count` cameras only."""
         return replace(self, viewmats=self.viewmats[:count], Ks=self.Ks[:count])
