@@ -25,7 +25,6 @@ import dataclasses
 import itertools
 import json
 import re
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -202,7 +201,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--generation-log", type=Path, help="what blitzgs synth printed, for its seconds")
     parser.add_argument("--collect", action="store_true", help="train nothing; write tables and JSON")
     args, overrides = parser.parse_known_args(arguments)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
         if args.collect:
             print(collect(args))

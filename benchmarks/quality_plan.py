@@ -14,12 +14,14 @@ import hashlib
 import itertools
 import json
 import shlex
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
+from harness import markdown_table
 from opponents.gsplat_training import STRATEGIES, GsplatOptions
 
 from blitzgs.config.fields import Config
@@ -243,28 +245,32 @@ def stress_markdown(runs: Sequence[dict[str, Any]]) -> str:
     Args:
         runs: results of `bm_quality.py --stress`; others are left out.
     """
-    cells: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
+    cells: dict[tuple[str, str, str], list[dict[str, Any]]] = defaultdict(list)
     for run in runs:
         change, _, column = run["recipe"].partition("+")
         if run["status"] == "done" and column:
-            cells.setdefault((run["capture"], column, change), []).append(run)
-    worst = {key: min(_psnr(run) for run in group) for key, group in cells.items()}
-    lines = [
-        "| capture | schedule, batch | change | seeds | PSNR | below the column's best | largest fall |",
-        "|---|---|---|---|---|---|---|",
-    ]
+            cells[run["capture"], column, change].append(run)
+    worst = {key: min(end_of(run)["psnr"] for run in group) for key, group in cells.items()}
+    rows = []
     for (capture, column, change), group in sorted(cells.items()):
         best = max(value for key, value in worst.items() if key[:2] == (capture, column))
         psnr = worst[capture, column, change]
-        fall = max(run["largest_fall"] for run in group)
-        lines.append(
-            f"| {capture} | {column} | {change} | {len(group)} "
-            f"| {psnr:.2f} | {best - psnr:.2f} | {fall:.2f} |"
+        rows.append(
+            {
+                "capture": capture,
+                "schedule, batch": column,
+                "change": change,
+                "seeds": len(group),
+                "PSNR": f"{psnr:.2f}",
+                "below the column's best": f"{best - psnr:.2f}",
+                "largest fall": f"{max(run['largest_fall'] for run in group):.2f}",
+            }
         )
-    return "\n".join(lines) + "\n"
+    return markdown_table(rows) + "\n"
 
 
-def _psnr(run: dict[str, Any]) -> float:
-    last = run["evaluations"][-1]
-    psnr: float = last.get("test", last.get("train"))["psnr"]
-    return psnr
+def end_of(run: dict[str, Any]) -> dict[str, Any]:
+    """Return the last metrics of a run: of its held-out views, or of all views if none is held out."""
+    last: dict[str, Any] = run["evaluations"][-1]
+    metrics: dict[str, Any] = last.get("test", last.get("train"))
+    return metrics

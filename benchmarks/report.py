@@ -13,15 +13,14 @@ names the command that makes it.
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import sys
 from pathlib import Path
 
+from harness import ROOT, make_parser
 from report_tables import SECTIONS, Json
 
-ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 PAGES = (*(ROOT / "docs" / name for name in ("performance.md", "city.md")), ROOT / "README.md")
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end: \2 -->)", re.DOTALL)
@@ -170,9 +169,7 @@ def render_page(text: str, results: Results) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Write or check the pages; returns the exit status."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, device=None, writes_json=False)
     parser.add_argument(
         "--check", action="store_true", help="change nothing; fail when a page is out of date"
     )

@@ -12,17 +12,12 @@ from typing import Any
 
 from harness import markdown_table
 from opponents.spatial_partition import makespan
+from quality_plan import end_of
 from quality_report import Run, labels, spread
 
 Row = dict[str, Any]
 Worst = Callable[[Iterable[float]], float]
 PAPER_GPUS = 4  # number of GPUs on which the paper trained its blocks
-
-
-def _end(run: Run) -> dict[str, float]:
-    last: dict[str, Any] = run["evaluations"][-1]
-    found: dict[str, float] = last.get("test", last.get("train"))
-    return found
 
 
 def _mean_memory(run: Run) -> float | None:
@@ -33,10 +28,10 @@ def _mean_memory(run: Run) -> float | None:
 # Columns of a finished run: name, value (None: not measured), format, and the function that picks the worst
 # seed.
 FIGURES: tuple[tuple[str, Callable[[Run], float | None], str, Worst], ...] = (
-    ("PSNR", lambda run: _end(run)["psnr"], "{:.2f}", min),
-    ("corrected PSNR", lambda run: _end(run).get("psnr_corrected"), "{:.2f}", min),
-    ("SSIM", lambda run: _end(run)["ssim"], "{:.4f}", min),
-    ("LPIPS", lambda run: _end(run).get("lpips"), "{:.4f}", max),
+    ("PSNR", lambda run: end_of(run)["psnr"], "{:.2f}", min),
+    ("corrected PSNR", lambda run: end_of(run).get("psnr_corrected"), "{:.2f}", min),
+    ("SSIM", lambda run: end_of(run)["ssim"], "{:.4f}", min),
+    ("LPIPS", lambda run: end_of(run).get("lpips"), "{:.4f}", max),
     ("images/s", lambda run: run["images_per_second"], "{:.0f}", min),
     ("seconds", lambda run: run["seconds"], "{:.1f}", max),
     ("peak M", lambda run: run["peak_gaussians"] / 1e6, "{:.3f}", max),
