@@ -144,10 +144,7 @@ class Pool:
             # Free the old pool before allocating the new one.
             self.held.columns.clear()
             self._storage.clear()
-            self._storage = {
-                name: torch.zeros((allocated_rows, *row.shape), dtype=row.dtype, device=self._device)
-                for name, row in ((name, table.row_of(name)) for name in names)
-            }
+            self._storage = {n: table.row_of(n).zeros(allocated_rows, self._device) for n in names}
         self.held = self._held_of({name: self._storage[name] for name in names}, rows)
         self._block_in = np.full(slots, _FREE, dtype=np.int64)
         self._slot_of = np.full(self._blocks, _FREE, dtype=np.int64)
