@@ -197,10 +197,6 @@ class PointBlocks:
     def __len__(self) -> int:
         return len(self.low)
 
-    def rows(self, values: Tensor) -> Tensor:
-        """Return the value [B] of each block for each of its points, [M] in the order of `order`."""
-        return values.repeat_interleave(BLOCK_POINTS)[: len(self.order)]
-
     def distances_of(self, centres: Tensor, chosen: Tensor, filling: float) -> Tensor:
         """Return the distances of cameras to all points of some blocks.
 
