@@ -38,51 +38,21 @@ from blitzgs.optim import LazyAdam
 
 
 class OneImport(GsplatTrainer):
-    """gsplat's loop with another renderer.
+    """gsplat's loop with another renderer."""
 
-    Attributes:
-        loss_name: whose kernels compute the loss.
-    """
-
+    # Whose kernels compute the loss.
     loss_name = "fused_ssim" if find_spec("fused_ssim") else "blitzgs.l1_ssim"
 
-    rasterization: Any = staticmethod(blitzgs.rasterization)
-
-    def loss(self, renders: Tensor, target: Tensor) -> Tensor:
+    def loss(self, renders: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
         """Return L1 and SSIM, with the kernels that gsplat's trainer uses where they are installed."""
         if self.loss_name != "fused_ssim":
-            return blitzgs.l1_ssim(renders, target)
+            return blitzgs.l1_ssim(renders, target, ssim_weight=self.options.ssim_lambda)
         from fused_ssim import fused_ssim
 
         target = target / 255.0
         l1 = torch.nn.functional.l1_loss(renders, target)
         similar = fused_ssim(renders.permute(0, 3, 1, 2), target.permute(0, 3, 1, 2), padding="valid")
         return torch.lerp(l1, 1.0 - similar, self.options.ssim_lambda)
-
-    def render(self, views: Any) -> tuple[Tensor, Any]:
-        """Return the image of a view and what the strategy needs of it."""
-        p = self.params
-        image, _, info = self.rasterization(
-            p["means"], p["quats"], torch.exp(p["scales"]), torch.sigmoid(p["opacities"]),
-            torch.cat([p["sh0"], p["shN"]], 1), views.viewmats, views.Ks, views.width, views.height,
-            sh_degree=self.sh_degree, packed=self.options.packed,
-        )  # fmt: skip
-        return image, info
-
-    def move(self) -> None:
-        """Take the optimisers' step."""
-        for optimiser in self._optimisers.values():
-            optimiser.step()
-            optimiser.zero_grad(set_to_none=True)
-
-    def _take_step(self) -> None:
-        views, target, _ = self._batches[next(self._order)]
-        image, info = self.render(views)
-        self._strategy.step_pre_backward(self.params, self._optimisers, self._state, self.step, info)
-        self.loss(image, target).backward()
-        self.move()
-        self._decay.step()
-        self.change_population(info)
 
 
 # Refinements from one sorting of the rows to the next: each appends few rows, so the order stays good.
@@ -102,10 +72,6 @@ class FourSwaps(OneImport):
             for name, adam in adams.items()
         }
         return params, lazy
-
-    def loss(self, renders: Tensor, target: Tensor) -> Tensor:
-        """Return L1 and SSIM in one kernel."""
-        return blitzgs.l1_ssim(renders, target, ssim_weight=self.options.ssim_lambda)
 
     def render(self, views: Any) -> tuple[Tensor, Any]:
         """Return the image of a view and what the strategy needs of it."""
