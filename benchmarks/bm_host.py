@@ -53,14 +53,9 @@ CALLS: dict[str, dict[str, Any]] = {
 def measure(
     device: str, repeats: int, views: int = 1, read_meta: bool = False, **options: Any
 ) -> list[float]:
-    """Return the median microseconds of the forward and of the backward pass.
+    """Return the median microseconds of the forward pass, with all of `meta` if it is read, and the backward.
 
-    Args:
-        device: where to render.
-        repeats: number of timed calls.
-        views: number of views.
-        read_meta: whether to read all entries of `meta`, as part of the forward pass.
-        options: further arguments of `rasterization`.
+    `options`: further arguments of `rasterization`.
     """
     scene = aerial(GAUSSIANS, device, views=views, width=WIDTH, height=HEIGHT)
     options = {"sh_degree": 1, **options}
@@ -83,12 +78,7 @@ def measure(
 
 
 class Trainer:
-    """A trainer of one view, as small as its host time allows.
-
-    Attributes:
-        params: the parameters by name.
-        seconds: of each part of the steps so far.
-    """
+    """A trainer of one view, as small as its host time allows; has the seconds of each part of its steps."""
 
     def __init__(self, device: str, in_one: bool = False) -> None:
         """Take the Gaussians and the view of the benchmark's scene; `in_one`: one optimiser for all."""

@@ -54,35 +54,24 @@ PRINT_EVERY = 60.0  # seconds between two lines about the present runs
 
 @dataclass
 class Job:
-    """A run and its process.
-
-    Attributes:
-        spec: the run.
-        slot: number of the run's slot, which decides its GPU.
-        process: process of the run.
-        log: file to which the process prints.
-    """
+    """A run and its process."""
 
     spec: RunSpec
-    slot: int
+    slot: int  # decides its GPU
     process: subprocess.Popen[bytes]
-    log: TextIO
+    log: TextIO  # to which the process prints
 
 
 class Pool:
-    """Runs trainings side by side, one in each slot.
+    """Runs trainings side by side, one in each slot."""
 
-    Attributes:
-        worker: program beside this file that does one run; it takes the paths of the run's SPEC and RESULT.
-    """
-
+    # Program beside this file that does one run; it takes the paths of the run's SPEC and RESULT.
     worker = "quality_run.py"
 
     def __init__(self, out: Path, gpus: int, per_gpu: int, ranks: int = 1) -> None:
         """Make `per_gpu` slots for each group of `ranks` GPUs; without a GPU, `per_gpu` slots for the CPU.
 
-        Raises:
-            ValueError: there are too few GPUs, or several runs would share them.
+        ValueError: there are too few GPUs, or several runs would share them.
         """
         if ranks > 1 and (per_gpu > 1 or 0 < gpus < ranks):
             raise ValueError(f"--ranks {ranks} needs as many --gpus, and --per-gpu 1")

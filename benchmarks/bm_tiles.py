@@ -136,10 +136,9 @@ def measure(
 ) -> dict[str, Any]:
     """Fly through a tileset.
 
-    Returns:
-        Numbers of Gaussians of the model and of all tiles, their bytes, and for each error and frame:
-        distance, tiles and Gaussians of the picture, those that it needs loaded, their bytes, those of the
-        flight so far, and PSNR in dB.
+    Returns numbers of Gaussians of the model and of all tiles, their bytes, and for each error and frame:
+    distance, tiles and Gaussians of the picture, those that it needs loaded, their bytes, those of the flight
+    so far, and PSNR in dB.
     """
     city = City(folder, torch.device(device))
     view, size = city.view, (width, width * 9 // 16)

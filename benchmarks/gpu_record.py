@@ -45,19 +45,15 @@ BENCHES = {
 
 @dataclass
 class Outcome:
-    """The tests of one entry of tests/.
-
-    Attributes:
-        state: "done"; "cut off" by the time limit; or "died": the process ended without results.
-        problems: name and first line of each failure and error.
-    """
+    """The tests of one entry of tests/."""
 
     passed: int = 0
     failed: int = 0
     errors: int = 0
     skipped: int = 0
     seconds: float = 0.0
-    state: str = "done"
+    state: str = "done"  # "cut off" by the time limit; or "died": the process ended without results
+    # Name and first line of each failure and error.
     problems: list[dict[str, str]] = field(default_factory=list)
 
     def add(self, other: Outcome) -> None:
@@ -91,11 +87,8 @@ def read_junit(path: Path) -> Outcome:
 def run_pytest(target: Path, mark: str, folder: Path, end: float) -> Outcome:
     """Run a file or folder of tests.
 
-    Args:
-        target: the file or folder.
-        mark: the expression of pytest's -m.
-        folder: for the log and the results of pytest.
-        end: of `time.monotonic`; pytest is interrupted then, and writes what it has.
+    `mark`: the expression of pytest's -m. `folder`: for the log and the results of pytest. `end`: of
+    `time.monotonic`; pytest is interrupted then, and writes what it has.
     """
     name = "_".join(target.with_suffix("").parts[-2:])
     results = folder / f"{name}.xml"
@@ -177,11 +170,7 @@ def bench_rows(name: str, result: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def environment() -> dict[str, Any]:
-    """Return card, driver and versions.
-
-    Raises:
-        SystemExit: there is no CUDA device.
-    """
+    """Return card, driver and versions (SystemExit: there is no CUDA device)."""
     if not torch.cuda.is_available():
         raise SystemExit("gpu_record.py: torch finds no CUDA device here; run it on a machine with a GPU")
     found = harness.environment("cuda")
@@ -232,19 +221,10 @@ def make_record(
     longest: float = float("inf"),
     jobs: int = 1,
 ) -> bool:
-    """Fill the record until it is complete or the time is over.
+    """Fill the record, which is written after each step, until it is complete or the time is over.
 
-    Args:
-        record: is written after each step.
-        tests: folders or files of tests.
-        mark: the expression of pytest's -m.
-        folder: for logs.
-        end: of `time.monotonic`.
-        longest: seconds that an entry of the tests may take.
-        jobs: entries of the tests that run side by side.
-
-    Returns:
-        Whether all ran and passed.
+    `tests`: folders or files. `folder`: for logs. `end`: of `time.monotonic`. `longest`: seconds that an
+    entry of the tests may take. `jobs`: entries that run side by side. Returns whether all ran and passed.
     """
     for name in BENCHES:
         if not record.content["bench"].get(name) or "error" in record.content["bench"][name][0]:

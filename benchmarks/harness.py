@@ -86,12 +86,9 @@ def command_line() -> str:
 
 
 def write_json(path: Path, device: torch.device | str, **results: Any) -> None:
-    """Write the results of a benchmark as JSON, with what `benchmarks/report.py` has to know about them.
+    """Write the results of a benchmark as JSON, with "command", "commit" and "environment" for `report.py`.
 
-    Args:
-        path: the file; its folder is made.
-        device: on which the benchmark ran.
-        results: what was measured, beside the keys "command", "commit" and "environment".
+    The folder is made. `device`: on which the benchmark ran.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     about = {"command": command_line(), "commit": commit(), "environment": environment(device)}
@@ -134,13 +131,10 @@ def make_parser(
     repeats: int | None = None,
     writes_json: bool = True,
 ) -> argparse.ArgumentParser:
-    """Return a parser of the options that benchmarks share.
+    """Return a parser of the options that benchmarks share; --help prints the description as it is written.
 
-    Args:
-        description: the docstring of the benchmark, which --help prints as it is written.
-        device: default of --device; None: the benchmark has no such option.
-        repeats: default of --repeats; None: the benchmark has no such option.
-        writes_json: whether there is --json.
+    `device`, `repeats`: defaults of --device and --repeats; None: no such option. `writes_json`: whether
+    there is --json.
     """
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter

@@ -21,9 +21,7 @@ Group = tuple[str, str]  # capture, label of the recipe
 def read_runs(source: Path) -> list[Run]:
     """Return the runs in a folder of results, of its `runs` folder or of one collected JSON file.
 
-    Raises:
-        ValueError: a file holds something else.
-        OSError: the folder or file does not exist.
+    ValueError: a file holds something else. OSError: the folder or file does not exist.
     """
     if source.is_dir():
         inner = source / RUNS if (source / RUNS).is_dir() else source
@@ -55,11 +53,7 @@ def is_done(out: Path, name: str) -> bool:
 
 
 def report(out: Path) -> str:
-    """Write quality.json and quality.md into `out`.
-
-    Returns:
-        The Markdown.
-    """
+    """Write quality.json and quality.md into `out`; return the Markdown."""
     runs = read_runs(out / RUNS)
     text = markdown(runs)
     (out / "quality.json").write_text(json.dumps({"runs": runs}))

@@ -90,8 +90,7 @@ def group_of(name: str) -> tuple[str, ...]:
 def load_results(folder: Path = RESULTS) -> Results:
     """Read every result.
 
-    Raises:
-        ReportError: a file has no known name, does not name its commit, or is of several or another one.
+    ReportError: a file has no known name, does not name its commit, or is of several or another one.
     """
     results: Results = {}
     for path in sorted(folder.glob("*.json")):
@@ -152,11 +151,7 @@ def section_lines(name: str, results: Results) -> list[str]:
 
 
 def render_page(text: str, results: Results) -> str:
-    """Return a page with every table replaced.
-
-    Raises:
-        ReportError: the page names an unknown table.
-    """
+    """Return a page with every table replaced (ReportError: the page names an unknown table)."""
 
     def replace(match: re.Match[str]) -> str:
         if match[2] not in SECTIONS:

@@ -62,15 +62,9 @@ def recipes_of(
 ) -> dict[str, str]:
     """Return the recipes of a table for `bm_quality.py`.
 
-    Args:
-        plan: the table's entry of `paper_tables.yaml`.
-        config: file that all arms start from, or "defaults".
-        gate: model file of a spawn gate, or None.
-        flags: flags of all arms; those of an arm follow them.
-        arms: names of the arms; None: all.
-
-    Raises:
-        ValueError: the table has no such arm.
+    `plan`: the table's entry of `paper_tables.yaml`. `config`: file that all arms start from, or "defaults".
+    `gate`: model file of a spawn gate. `flags`: of all arms; those of an arm follow them. `arms`: their
+    names; None: all. ValueError: the table has no such arm.
     """
     known = [*plan["arms"], *plan.get("opponents", {})]
     if arms is not None and (unknown := sorted(set(arms) - set(known))):
@@ -154,11 +148,7 @@ def read_results(table: str, out: Path) -> dict[str, Any]:
 
 
 def tabulate(table: str, plan: dict[str, Any], out: Path) -> str:
-    """Write the table of all results in a folder; returns its Markdown.
-
-    Raises:
-        ValueError: there are none.
-    """
+    """Write the table of all results in a folder; returns its Markdown (ValueError: there are none)."""
     reference, parts = plan.get("reference", []), []
     rows: list[dict[str, Any]] = []
     if table in TRAINED:

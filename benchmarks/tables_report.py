@@ -44,9 +44,7 @@ FIGURES: tuple[tuple[str, Callable[[Run], float | None], str, Worst], ...] = (
 def arm_rows(runs: Sequence[Run], arms: dict[str, dict[str, Any]]) -> tuple[list[Row], list[Row]]:
     """Return a row for each capture, arm and number of ranks: as text, and as numbers for the CSV file.
 
-    Args:
-        runs: finished runs.
-        arms: name of the recipe -> its "title" and, where the paper has it, its row in "paper".
+    `arms`: name of the recipe -> its "title" and, where the paper has it, its row in "paper".
     """
     groups: dict[tuple[str, int, int, str], list[Run]] = defaultdict(list)
     order, label = list(arms), labels(runs)
@@ -179,17 +177,10 @@ def popping_rows(scene: str, found: dict[str, Any]) -> list[Row]:
 
 
 def write(out: Path, table: str, source: str, parts: Sequence[tuple[str, list[Row]]], rows: list[Row]) -> str:
-    """Write TABLE.md and TABLE.csv into a folder.
+    """Write TABLE.md and TABLE.csv into a folder; returns the Markdown.
 
-    Args:
-        out: the folder.
-        table: name of both files.
-        source: place of the figures in the paper.
-        parts: title and rows of each table of the Markdown; those without rows are left out.
-        rows: rows of the CSV file.
-
-    Returns:
-        The Markdown.
+    `source`: place of the figures in the paper. `parts`: title and rows of each table of the Markdown; those
+    without rows are left out. `rows`: of the CSV file.
     """
     text = [f"# {table}\n", f"Medians over the seeds, the worst in brackets. Paper: {source}.\n"]
     text += [f"## {title}\n\n{markdown_table(part)}\n" for title, part in parts if part]
