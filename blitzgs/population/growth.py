@@ -79,14 +79,10 @@ def memory_limit(table: GaussianTable, ranks: Ranks) -> int | None:
 
 
 def rows_that_fit(rows: int, row_bytes: int, widest_column: int, available: int, scratch: int) -> int:
-    """Return how many rows of a table fit into memory.
+    """Return how many rows of a table, which has `rows` now, fit into `available` bytes.
 
-    Args:
-        rows: present number of rows of the table.
-        row_bytes: bytes of one row in all columns.
-        widest_column: bytes of one row in the widest column, which is copied when the table grows.
-        available: bytes for the table and everything else.
-        scratch: largest number of bytes needed so far beyond the present table.
+    `row_bytes`: of one row in all columns; `widest_column`: in the widest one, which is copied when the table
+    grows. `scratch`: largest number of bytes needed so far beyond the present table.
     """
     each = row_bytes + widest_column + scratch / max(rows, 1)
     return int(MEMORY_SHARE * available / each)

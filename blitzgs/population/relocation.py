@@ -152,17 +152,10 @@ def draw_in_proportion(
     Chen 1998). This has the least variance, and exactly `count` draws in all, except that no row is drawn
     `MAX_COPIES` times.
 
-    Args:
-        weights: int64 [N_rank], 0 to 2^31, fewer than 2^31 over all ranks.
-        total: sum of the weights of all ranks.
-        count: below 2^31.
-        ids: int64 [N_rank], persistent.
-        time: time of the event, in images.
-        ranks: the job; every rank calls this.
-
-    Returns:
-        int64 [N_rank], how often each row was drawn, the same for the same ids at every world size. Zeros if
-        all weights are 0.
+    `weights`: int64 [N_rank], 0 to 2^31, fewer than 2^31 over all ranks; `total`: their sum over all ranks.
+    `count`: below 2^31. `ids`: int64 [N_rank], persistent. `time`: of the event, in images. Every rank calls
+    this. Returns int64 [N_rank], how often each row was drawn, the same for the same ids at every world size;
+    zeros if all weights are 0.
     """
     if total == 0 or count <= 0:
         return torch.zeros_like(weights)

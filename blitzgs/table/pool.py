@@ -83,11 +83,8 @@ class Pool:
     ) -> None:
         """Allocate the pool (PoolError: the budget is less than two blocks).
 
-        Args:
-            table: the table on the host; pinned if `device` is a GPU.
-            device: device of the pool.
-            budget_bytes: bytes of the device that the pool may take.
-            pending_table: as for `BlockIndex`, on the device.
+        `table`: on the host, pinned if `device` is a GPU. `budget_bytes`: of the device that the pool may
+        take. `pending_table`: as for `BlockIndex`, on the device.
         """
         self.table, self._device, self._budget = table, device, budget_bytes
         self.moved = Moved()
