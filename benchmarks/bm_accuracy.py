@@ -310,8 +310,7 @@ def main() -> None:
         rows.append(figures)
         lines = accuracy_lines({"rows": [asdict(figures)]})
         print("\n".join(lines[0 if len(rows) == 1 else -1 :]), flush=True)
-        if args.json:
-            write_json(args.json, args.device, title=title, rows=[asdict(row) for row in rows])
+        write_json(args.json, args.device, title=title, rows=[asdict(row) for row in rows])
 
     for option in options_for(args.device):
         if args.only in (None, option.name):

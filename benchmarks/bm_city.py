@@ -136,8 +136,7 @@ def collect(args: Any) -> str:
         "commit": " and ".join(sorted({run["commit"] for run in runs})),
         "environment": known[0]["environment"] if known else {},
     }
-    if args.json is not None:
-        write_json(args.json, "cpu", **about, **file)
+    write_json(args.json, "cpu", **about, **file)
     lines = [f"# The city\n\n`{about['command']}`, commit {about['commit']}"]
     for name, rows_of in TABLES.items():
         if rows := rows_of(file):

@@ -197,8 +197,7 @@ def main() -> None:
                 f"{k} {v:.3f}" if isinstance(v, float) else f"{k} {v}" for k, v in result.items()
             )
             print(shown, flush=True)
-        if args.json:
-            write_json(args.json, args.device, results=results)
+        write_json(args.json, args.device, results=results)
     ranks.close()
 
 

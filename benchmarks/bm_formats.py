@@ -82,8 +82,7 @@ def main() -> int:
     args = parser.parse_args()
     if args.memory:
         rows = memory(args.run)
-        if args.json:
-            write_json(args.json, "cpu", memory=rows)
+        write_json(args.json, "cpu", memory=rows)
         return 0
     run = open_run(args.run)
     # Views without the gate of the levels, which most formats cannot hold.
@@ -120,9 +119,8 @@ def main() -> int:
                 }
             )
             print(rows[-1], flush=True)
-    if args.json:
-        about = {"gaussians": len(model), "sh_degree": model.sh_degree, "views": len(views)}
-        write_json(args.json, "cpu", **about, formats=rows)
+    about = {"gaussians": len(model), "sh_degree": model.sh_degree, "views": len(views)}
+    write_json(args.json, "cpu", **about, formats=rows)
     return 0
 
 

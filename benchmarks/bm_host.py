@@ -196,8 +196,7 @@ def main() -> None:
     report("Host time of a trainer's step", steps, None, args.device)
     training = measure_training(args.device, args.repeats)
     report("Host time of a training's step", training, None, args.device)
-    if args.json:
-        write_json(args.json, args.device, rows=rows, steps=steps, training=training)
+    write_json(args.json, args.device, rows=rows, steps=steps, training=training)
 
 
 if __name__ == "__main__":

@@ -204,8 +204,7 @@ def main() -> None:
     with torch.no_grad():
         device = torch.device(args.device)
         for found in run(args.gaussians, args.ratios, args.orders, args.batch_size, args.steps, device):
-            if args.json:
-                write_json(args.json, args.device, **found)
+            write_json(args.json, args.device, **found)
     print(f"{found['scene']}, B = {args.batch_size}, table {found['table_gb']:.2f} GB")
     print("\n".join(offload_lines(found)))
     for row in found["results"]:

@@ -195,8 +195,7 @@ def main() -> None:
                       f"total {r['total']:7.3f} ms  peak {r['peak_gb']:.2f} GB  "
                       f"x{r['total'] / result['blitzgs']['total']:.2f}", flush=True)  # fmt: skip
         torch.cuda.empty_cache()
-    if args.json:
-        write_json(args.json, "cuda", results=results)
+    write_json(args.json, "cuda", results=results)
 
 
 if __name__ == "__main__":

@@ -182,8 +182,7 @@ def main() -> None:
     parser.add_argument("--order", default="morton", choices=["morton", "random"], help="of the rows")
     args = parser.parse_args()
     results = [run(name, args.views, args.order, args.repeats) for name in args.scenes]
-    if args.json:
-        write_json(args.json, "cuda", results=results)
+    write_json(args.json, "cuda", results=results)
 
 
 if __name__ == "__main__":

@@ -85,11 +85,13 @@ def command_line() -> str:
     return shlex.join(["python", *words])
 
 
-def write_json(path: Path, device: torch.device | str, **results: Any) -> None:
+def write_json(path: Path | None, device: torch.device | str, **results: Any) -> None:
     """Write the results of a benchmark as JSON, with "command", "commit" and "environment" for `report.py`.
 
-    The folder is made. `device`: on which the benchmark ran.
+    The folder is made. None: nothing is written. `device`: on which the benchmark ran.
     """
+    if path is None:
+        return
     path.parent.mkdir(parents=True, exist_ok=True)
     about = {"command": command_line(), "commit": commit(), "environment": environment(device)}
     path.write_text(json.dumps(about | results, indent=1) + "\n")
@@ -155,8 +157,7 @@ def report(
     info = environment(device)
     print(f"## {title}\n\n{', '.join(f'{key} {value}' for key, value in info.items())}\n")
     print(markdown_table(rows) + "\n")
-    if path is not None:
-        write_json(path, device, title=title, rows=list(rows))
+    write_json(path, device, title=title, rows=list(rows))
 
 
 def synchronize(device: torch.device | str) -> None:

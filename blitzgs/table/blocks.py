@@ -176,7 +176,7 @@ class Cameras(NamedTuple):
 
 
 class BlockVisibility:
-    """Tests which blocks the views of several batches may see, and copies the result to the host meanwhile."""
+    """Tests which blocks the views of several batches may see; the host gets the result meanwhile."""
 
     def __init__(
         self, bounds: Tensor, cameras: Cameras, batch_size: int, culled: Tensor | None = None
