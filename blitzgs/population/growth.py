@@ -60,10 +60,7 @@ def memory_limit(table: GaussianTable, ranks: Ranks) -> int | None:
         return None
     sizes = table.row_bytes.values()
     if table.device.type == "cpu":
-        free = available_bytes()
-        if free is None:
-            return None
-        available, scratch = free // ranks.local_world_size + table.memory_bytes, 0
+        available, scratch = available_bytes() // ranks.local_world_size + table.memory_bytes, 0
     else:
         # One query; `torch.cuda.memory_allocated` and the like each collect and flatten all statistics.
         statistics = torch.cuda.memory_stats_as_nested_dict(ranks.device)
