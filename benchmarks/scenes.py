@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic
+from blitzgs.formats.gaussians import SH_C0
+
 SH_COEFFICIENTS = 16  # degree 3
 
 

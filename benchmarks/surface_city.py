@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from harness import make_parser
-from scenes import SH_C0
 
+from blitzgs.formats.gaussians import SH_C0
 from blitzgs.formats.ply import write_ply
 from blitzgs_synth.flight import View, plan_flight
 from blitzgs_synth.photographs import each

@@ -28,10 +28,10 @@ from blitzgs import quat_scale_to_covar_preci, rasterization, relocate
 from blitzgs.capture.cameras import camera_centres
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.images import ImageStore
+from blitzgs.formats.gaussians import SH_C0
 from blitzgs.frame.render import RenderOptions
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.photometric import photometric_loss
-from blitzgs.population.initialisation import SH_C0
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.views import Space, ViewSet
 
