@@ -198,12 +198,10 @@ def _flight(
 def _camera(cameras: Any, name: str | None) -> CameraLike:
     if name is None:
         axes = np.stack([camera.world_to_camera[2, :3] for camera in cameras])
-        chosen: CameraLike = cameras[int((axes @ axes.mean(0)).argmax())]
-        return chosen
+        return cameras[int((axes @ axes.mean(0)).argmax())]
     for camera in cameras:
         if camera.name == name:
-            found: CameraLike = camera
-            return found
+            return camera
     raise ValueError(f"the run has no view '{name}'; it has for example {cameras[0].name}")
 
 

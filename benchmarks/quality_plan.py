@@ -234,6 +234,5 @@ def stress_markdown(runs: Sequence[dict[str, Any]]) -> str:
 
 def end_of(run: dict[str, Any]) -> dict[str, Any]:
     """Return the last metrics of a run: of its held-out views, or of all views if none is held out."""
-    last: dict[str, Any] = run["evaluations"][-1]
-    metrics: dict[str, Any] = last.get("test", last.get("train"))
-    return metrics
+    last = run["evaluations"][-1]
+    return last.get("test", last.get("train"))

@@ -80,8 +80,7 @@ class Grid:
         place = np.array([cell % self.shape[0], cell // self.shape[0]])
         low = np.where(place == 0, -np.inf, place - halo)
         high = np.where(place == self.shape - 1, np.inf, place + 1 + halo)
-        within: npt.NDArray[np.bool_] = ((coordinates >= low) & (coordinates < high)).all(axis=1)
-        return within
+        return ((coordinates >= low) & (coordinates < high)).all(axis=1)
 
 
 @dataclass(frozen=True)
@@ -210,7 +209,4 @@ def _in_picture(points: Float64, camera: Any) -> npt.NDArray[np.bool_]:
     seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     pixels = seen @ camera.K.T
     x, y, depth = pixels[:, 0], pixels[:, 1], seen[:, 2]
-    inside: npt.NDArray[np.bool_] = (
-        (depth > 0) & (x >= 0) & (y >= 0) & (x < camera.width * depth) & (y < camera.height * depth)
-    )
-    return inside
+    return (depth > 0) & (x >= 0) & (y >= 0) & (x < camera.width * depth) & (y < camera.height * depth)

@@ -73,7 +73,7 @@ class Drawer:
         """
         begin, subject, ranks = time.perf_counter(), self._subject, self._owners.ranks
         device = ranks.device
-        pose, K = (torch.from_numpy(matrix).float()[None].to(device) for matrix in (look.viewmat, look.K))  # noqa: N806
+        pose, K = (torch.from_numpy(matrix).float()[None].to(device) for matrix in (look.viewmat, look.K))
         views = Views(pose, K, look.width, look.height)
         options = self._options(look)
         ranges = assignment = None
