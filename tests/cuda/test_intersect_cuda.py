@@ -4,10 +4,10 @@
 import pytest
 import torch
 
-from blitzgs.ops.blocks import ActiveRows, gate_views_
+from blitzgs.ops.blocks import gate_views_
 from blitzgs.ops.importance import STEPS, MassCut
 from blitzgs.table.table import GaussianTable
-from blitzgs.view.gate import ViewGate
+from blitzgs.view.gate import ViewGate, all_rows
 from tests.cuda.conftest import Scene, ops
 from tests.table.test_blocks import make_views
 from tests.view.test_gate import GATE, bits, kept_by_definition, make_scene
@@ -241,12 +241,8 @@ def test_cuda_equals_cpu_on_many_items(n_segments):
 
 def gated(table, viewmats, gate, count):
     """Gate the first `count` rows of lists with a capacity for all rows; return their views."""
-    device, capacity = table.device, len(table)
-    active = ActiveRows(
-        torch.arange(capacity, dtype=torch.int32, device=device),
-        torch.full((capacity,), -1, dtype=torch.int32, device=device),
-        torch.tensor([count], dtype=torch.int32, device=device),
-    )
+    active = all_rows(len(table), 32, table.device)
+    active.length.fill_(count)
     gate_views_(active, table["means"], viewmats, gate.rules(table))
     assert (active.views[count:] == -1).all()
     return active.views[:count]
