@@ -7,7 +7,6 @@ A report is a Markdown table on stdout, and JSON with command, commit and machin
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import os
 import platform
@@ -17,7 +16,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -46,13 +44,7 @@ def environment(device: torch.device | str = "cpu") -> dict[str, Any]:
 def gsplat_version() -> str | None:
     """Return the version of gsplat; None if this process has not imported it."""
     module = sys.modules.get("gsplat")
-    if module is None:
-        return None
-    with contextlib.suppress(
-        metadata.PackageNotFoundError
-    ):  # sources on PYTHONPATH are in no list of packages
-        return metadata.version("gsplat")
-    return str(getattr(module, "__version__", "of unknown version"))
+    return None if module is None else str(getattr(module, "__version__", "of unknown version"))
 
 
 def commit() -> str:
