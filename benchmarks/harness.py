@@ -22,6 +22,7 @@ from typing import Any
 import torch
 
 ROOT = Path(__file__).resolve().parents[1]
+WARM_UP = 5  # steps before those that count
 BEST_DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
 
@@ -172,35 +173,6 @@ def torchrun(ranks: int) -> list[str]:
     return ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"]
 
 
-def median_ms(
-    function: Callable[..., Any], inputs: Sequence[tuple[Any, ...]], repeats: int = 30, warm_up: int = 5
-) -> float:
-    """Return the median milliseconds of ``function(*inputs[i])``, rotating among the input sets.
-
-    The sets together must be larger than the last-level cache; otherwise the cache is measured.
-    """
-    cuda = any(torch.is_tensor(x) and x.is_cuda for x in _flatten(inputs))
-    for i in range(warm_up):
-        function(*inputs[i % len(inputs)])
-    times = []
-    for i in range(repeats):
-        arguments = inputs[i % len(inputs)]
-        if cuda:
-            start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-            # Keeps the device busy while the work is queued, so that there are no gaps between launches.
-            torch.cuda._sleep(200_000)
-            start.record()
-            function(*arguments)
-            end.record()
-            end.synchronize()
-            times.append(start.elapsed_time(end))
-        else:
-            begin = time.perf_counter()
-            function(*arguments)
-            times.append(1e3 * (time.perf_counter() - begin))
-    return statistics.median(times)
-
-
 class Clock:
     """Time between marks, on the device's own clock."""
 
@@ -231,24 +203,18 @@ def stage_medians(
     step: Callable[[Callable[[str], None]], object],
     repeats: int,
     prepare: Callable[[], object] = lambda: None,
-    warm_up: int = 5,
+    device: torch.device | str = "cuda",
 ) -> list[tuple[str, float]]:
-    """Return name and median milliseconds on CUDA of each stage, in order, last of the "total" of a step.
+    """Return name and median milliseconds of each stage, in order, last of the "total" of a step.
 
     `step` gets a function, to be called with the name of each stage at its end. `prepare` is not timed.
     """
     samples = []
-    for _ in range(warm_up + repeats):
+    for _ in range(WARM_UP + repeats):
         prepare()
-        clock = Clock()
+        clock = Clock(device)
         step(clock.mark)
         stages = clock.stages()
         samples.append([*stages, ("total", sum(ms for _, ms in stages))])
-    columns = zip(*samples[warm_up:], strict=True)
+    columns = zip(*samples[WARM_UP:], strict=True)
     return [(column[0][0], statistics.median(ms for _, ms in column)) for column in columns]
-
-
-def _flatten(value: Any) -> list[Any]:
-    if isinstance(value, list | tuple):
-        return [leaf for item in value for leaf in _flatten(item)]
-    return [value]
