@@ -152,7 +152,6 @@ def collect(args: Any) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the benchmark; returns the exit status: 1 when a planned run is not done."""
     parser = make_parser(__doc__, device=None)
     parser.add_argument("city", type=Path, help="folder that blitzgs synth has made")
     parser.add_argument("--out", type=Path, required=True, metavar="RESULTS", help="folder of the results")

@@ -164,7 +164,6 @@ def measure(name: str, capture: Any, images: ImageStore, options: argparse.Names
 
 
 def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
-    """Train with each arm in turn and report."""
     parser = make_parser(__doc__)
     parser.add_argument("capture", type=Path)
     parser.add_argument("--steps", type=int, default=7000)

@@ -180,7 +180,6 @@ def measure(millions: float, ranks: Ranks, args: argparse.Namespace) -> dict[str
 
 @torch.no_grad()
 def main() -> None:
-    """Measure all sizes; print tables, and write JSON when a file is named."""
     parser = make_parser(__doc__)
     parser.add_argument(
         "--millions", type=float, nargs="+", default=[1, 4, 12], help="Gaussians (%(default)s)"

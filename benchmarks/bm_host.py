@@ -166,7 +166,6 @@ def measure_training(device: str, repeats: int) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Measure all calls and the step; print tables and optionally write JSON."""
     args = make_parser(__doc__, repeats=500).parse_args()
     rows = []
     with torch.autograd.set_multithreading_enabled(False):

@@ -105,7 +105,6 @@ class Survey:
 
 
 def table_bytes(table: GaussianTable) -> int:
-    """Return the bytes of all columns."""
     return sum(table[name].nbytes for name in table)
 
 

@@ -206,7 +206,6 @@ def _camera(cameras: Any, name: str | None) -> CameraLike:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the benchmark."""
     parser = make_parser(__doc__)
     parser.add_argument("run", type=Path, help="folder of the run")
     parser.add_argument("--out", type=Path, help="folder for the chart and the clip (RUN/popping)")

@@ -217,7 +217,6 @@ def positive(text: str) -> int:
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the command line's parser."""
     parser = harness.make_parser(__doc__, device=None, writes_json=False)
     parser.add_argument("--out", type=Path, required=True, metavar="RESULTS", help="folder of the results")
     parser.add_argument("--capture", action="append", default=[], metavar='"NAME=DIR [--data.FIELD=VALUE]"')

@@ -178,7 +178,6 @@ def run(name: str, repeats: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measure the scenes asked for, print a table, optionally write JSON."""
     parser = make_parser(__doc__, device=None, repeats=30)
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
     args = parser.parse_args()

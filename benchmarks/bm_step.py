@@ -173,7 +173,6 @@ def run(name: str, views: int, order: str, repeats: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measure the scenes asked for, print the stages, and write them as JSON when a file is named."""
     parser = make_parser(__doc__, device=None, repeats=20)
     parser.add_argument(
         "--scenes", nargs="+", default=["aerial4", "aerial16"], choices=[*GAUSSIANS, "garden"]

@@ -162,7 +162,6 @@ def measure(folder: Path, device: str, frames: int, width: int, errors: tuple[fl
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the benchmark."""
     parser = make_parser(__doc__)
     parser.add_argument("tiles", type=Path, help="folder of the tileset")
     parser.add_argument("--errors", type=float, nargs="+", default=[4.0, 16.0, 64.0], help="in pixels")

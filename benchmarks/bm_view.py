@@ -115,7 +115,6 @@ def served(opened: Opened, size: tuple[int, int], seconds: float, full: bool) ->
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the benchmark."""
     parser = make_parser(__doc__)
     parser.add_argument("--gaussians", type=int, default=12_000_000)
     parser.add_argument("--model", type=Path, help="a run or a PLY file instead of the synthetic scene")

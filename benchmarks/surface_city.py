@@ -53,7 +53,6 @@ def turns_to(normals: Doubles) -> Doubles:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Make the model and write it."""
     parser = make_parser(__doc__, device=None, writes_json=False)
     parser.add_argument("file", type=Path)
     parser.add_argument("--preset", choices=PRESETS, default="city")

@@ -177,7 +177,6 @@ def tabulate(table: str, plan: dict[str, Any], out: Path) -> str:
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the command line's parser."""
     parser = harness.make_parser(__doc__, device=None, writes_json=False)
     parser.add_argument("table", choices=TABLES)
     parser.add_argument("--out", type=Path, required=True, metavar="TABLES", help="folder of the results")
