@@ -186,7 +186,7 @@ def _garden(noise: Noise, x: Floats, y: Floats, edge: Floats, footprint: Floats)
 
 
 def _square(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
-    """Return A paved square: bands of light stone every 5 m and slabs laid in two tones."""
+    """Return a paved square: bands of light stone every 5 m and slabs laid in two tones."""
     slab = cell_random(np.floor(x / 1.25), np.floor(y / 1.25), 23)
     tone = noise.layers(x, y, footprint, (7.0, 0.06), (1.0, 0.05), (0.3, 0.05))
     shade = (slab - 0.5) * 0.3 * resolved(1.25, footprint)
