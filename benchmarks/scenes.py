@@ -51,17 +51,6 @@ class BenchmarkScene:
         """Return the scene seen by its first `count` cameras only."""
         return replace(self, viewmats=self.viewmats[:count], Ks=self.Ks[:count])
 
-    def centres_in_view(self) -> Tensor:
-        """Return, per view, the fraction of the means that project inside the image: float32 [B]."""
-        fractions = []
-        for viewmat, K in zip(self.viewmats, self.Ks, strict=True):
-            points = self.means @ viewmat[:3, :3].T + viewmat[:3, 3]
-            pixels = points[:, :2] / points[:, 2:] * K.diagonal()[:2] + K[:2, 2]
-            size = torch.tensor([self.width, self.height], device=pixels.device)
-            inside = ((pixels > 0) & (pixels < size)).all(1) & (points[:, 2] > 0)
-            fractions.append(inside.float().mean())
-        return torch.stack(fractions)
-
 
 def aerial(
     n: int,
