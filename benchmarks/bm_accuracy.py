@@ -23,14 +23,14 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 
 import torch
 from gradients import parameter_gradients
-from harness import make_parser, median_ms, write_json
+from harness import make_parser, stage_medians, write_json
 from report_tables import accuracy_lines
 from scenes import BenchmarkScene, aerial
 from torch import Tensor
@@ -211,8 +211,12 @@ class Renderer:
     def step_ms(self, repeats: int) -> float:
         """Return the milliseconds of forward and backward, per view."""
         v_renders = torch.randn_like(self.forward().renders)
-        step = median_ms(lambda v: self.backward(self.forward(), v), [(v_renders,)], repeats, warm_up=3)
-        return step / len(self.views)
+
+        def step(mark: Callable[[str], None]) -> None:
+            self.backward(self.forward(), v_renders)
+            mark("step")
+
+        return stage_medians(step, repeats, device=v_renders.device)[-1][1] / len(self.views)
 
 
 @cache
@@ -311,8 +315,7 @@ def main() -> None:
         rows.append(figures)
         lines = accuracy_lines({"rows": [asdict(figures)]})
         print("\n".join(lines[0 if len(rows) == 1 else -1 :]), flush=True)
-        if args.json:
-            write_json(args.json, args.device, title=title, rows=[asdict(row) for row in rows])
+        write_json(args.json, args.device, title=title, rows=[asdict(row) for row in rows])
 
     for option in options_for(args.device):
         if args.only in (None, option.name):

@@ -25,7 +25,6 @@ import dataclasses
 import itertools
 import json
 import re
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -51,11 +50,7 @@ Json = dict[str, Any]
 
 
 class CityPool(Pool):
-    """Runs the trainings of the city.
-
-    Attributes:
-        args: of the command line.
-    """
+    """Runs the trainings of the city."""
 
     worker = "city_run.py"
 
@@ -84,10 +79,7 @@ def held_out(city: Path, count: int, path: Path) -> None:
 def plan(args: Any, overrides: Sequence[str]) -> list[CityRun]:
     """Return the runs: all arms on one rank, then the first arm on each further number of ranks.
 
-    The batch sizes after the first are for the first arm alone.
-
-    Raises:
-        ValueError: an argument cannot be used.
+    The batch sizes after the first are for the first arm alone. ValueError: an argument cannot be used.
     """
     views = sum(1 for _ in (args.city / "images").iterdir())
     if args.held_out >= views:
@@ -100,11 +92,8 @@ def plan(args: Any, overrides: Sequence[str]) -> list[CityRun]:
     if not arms:
         raise ValueError("nothing to train: --arms and --arm name no arm")
     recipes = {arm: f"'{CONFIG}' {flags} {common}" for arm, flags in arms.items()}
-    first, device, sizes = (
-        next(iter(arms)),
-        "cuda" if args.gpus else "cpu",
-        list(dict.fromkeys(args.batch_sizes)) or [None],
-    )
+    first, device = next(iter(arms)), "cuda" if args.gpus else "cpu"
+    sizes = list(dict.fromkeys(args.batch_sizes)) or [None]
     runs = []
     for ranks, size in itertools.product(dict.fromkeys(args.ranks), sizes):
         is_first = ranks == 1 and size == sizes[0]
@@ -112,23 +101,13 @@ def plan(args: Any, overrides: Sequence[str]) -> list[CityRun]:
         chosen = {arm: recipes[arm] + batch for arm in (arms if is_first else [first])}
         for spec in runs_of(capture, chosen, [0], [], None, device, ranks):
             frames = args.popping if is_first and spec.recipe == first else 0
-            runs.append(
-                CityRun(
-                    **dataclasses.asdict(spec),
-                    limit=args.seconds_per_run,
-                    popping=frames,
-                    command=command_line(),
-                )
-            )
+            limits = {"limit": args.seconds_per_run, "popping": frames, "command": command_line()}
+            runs.append(CityRun(**dataclasses.asdict(spec), **limits))
     return runs
 
 
 def about_city(city: Path, log: Path | None) -> Json:
-    """Return what `blitzgs synth` noted about the city, its images and bytes, and the seconds that it took.
-
-    Raises:
-        ValueError: the city is not finished.
-    """
+    """Return what `blitzgs synth` noted about the city, its images and bytes, and the seconds it took."""
     manifest = city / "city.json"
     if not manifest.exists():
         raise ValueError(
@@ -143,11 +122,7 @@ def about_city(city: Path, log: Path | None) -> Json:
 
 
 def collect(args: Any) -> str:
-    """Write city.md into the results, and the JSON; return the Markdown.
-
-    Raises:
-        OSError: the folder has no results.
-    """
+    """Write city.md into the results, and the JSON; return the Markdown (OSError: there are no results)."""
     order = {arm: place for place, arm in enumerate(ARMS)}
     runs = quality_report.read_runs(args.out / quality_report.RUNS)
     runs.sort(key=lambda run: (run["ranks"], order.get(run["recipe"], len(ARMS)), run.get("batch_size", 0)))
@@ -161,8 +136,7 @@ def collect(args: Any) -> str:
         "commit": " and ".join(sorted({run["commit"] for run in runs})),
         "environment": known[0]["environment"] if known else {},
     }
-    if args.json is not None:
-        write_json(args.json, "cpu", **about, **file)
+    write_json(args.json, "cpu", **about, **file)
     lines = [f"# The city\n\n`{about['command']}`, commit {about['commit']}"]
     for name, rows_of in TABLES.items():
         if rows := rows_of(file):
@@ -178,7 +152,6 @@ def collect(args: Any) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the benchmark; returns the exit status: 1 when a planned run is not done."""
     parser = make_parser(__doc__, device=None)
     parser.add_argument("city", type=Path, help="folder that blitzgs synth has made")
     parser.add_argument("--out", type=Path, required=True, metavar="RESULTS", help="folder of the results")
@@ -202,7 +175,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--generation-log", type=Path, help="what blitzgs synth printed, for its seconds")
     parser.add_argument("--collect", action="store_true", help="train nothing; write tables and JSON")
     args, overrides = parser.parse_known_args(arguments)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
         if args.collect:
             print(collect(args))

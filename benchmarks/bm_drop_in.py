@@ -21,14 +21,13 @@ autograd then runs the backward pass in the loop's own thread.
 from __future__ import annotations
 
 import argparse
-import time
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import torch
-from harness import make_parser, report, synchronize
+from harness import make_parser, report, seconds_of
 from opponents.gsplat_training import GsplatOptions, GsplatTrainer
 from torch import Tensor
 
@@ -39,51 +38,21 @@ from blitzgs.optim import LazyAdam
 
 
 class OneImport(GsplatTrainer):
-    """gsplat's loop with another renderer.
+    """gsplat's loop with another renderer."""
 
-    Attributes:
-        loss_name: whose kernels compute the loss.
-    """
-
+    # Whose kernels compute the loss.
     loss_name = "fused_ssim" if find_spec("fused_ssim") else "blitzgs.l1_ssim"
 
-    rasterization: Any = staticmethod(blitzgs.rasterization)
-
-    def loss(self, renders: Tensor, target: Tensor) -> Tensor:
+    def loss(self, renders: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
         """Return L1 and SSIM, with the kernels that gsplat's trainer uses where they are installed."""
         if self.loss_name != "fused_ssim":
-            return blitzgs.l1_ssim(renders, target)
+            return blitzgs.l1_ssim(renders, target, ssim_weight=self.options.ssim_lambda)
         from fused_ssim import fused_ssim
 
         target = target / 255.0
         l1 = torch.nn.functional.l1_loss(renders, target)
         similar = fused_ssim(renders.permute(0, 3, 1, 2), target.permute(0, 3, 1, 2), padding="valid")
         return torch.lerp(l1, 1.0 - similar, self.options.ssim_lambda)
-
-    def render(self, views: Any) -> tuple[Tensor, Any]:
-        """Return the image of a view and what the strategy needs of it."""
-        p = self.params
-        image, _, info = self.rasterization(
-            p["means"], p["quats"], torch.exp(p["scales"]), torch.sigmoid(p["opacities"]),
-            torch.cat([p["sh0"], p["shN"]], 1), views.viewmats, views.Ks, views.width, views.height,
-            sh_degree=self.sh_degree, packed=self.options.packed,
-        )  # fmt: skip
-        return image, info
-
-    def move(self) -> None:
-        """Take the optimisers' step."""
-        for optimiser in self._optimisers.values():
-            optimiser.step()
-            optimiser.zero_grad(set_to_none=True)
-
-    def _take_step(self) -> None:
-        views, target, _ = self._batches[next(self._order)]
-        image, info = self.render(views)
-        self._strategy.step_pre_backward(self.params, self._optimisers, self._state, self.step, info)
-        self.loss(image, target).backward()
-        self.move()
-        self._decay.step()
-        self.change_population(info)
 
 
 # Refinements from one sorting of the rows to the next: each appends few rows, so the order stays good.
@@ -103,10 +72,6 @@ class FourSwaps(OneImport):
             for name, adam in adams.items()
         }
         return params, lazy
-
-    def loss(self, renders: Tensor, target: Tensor) -> Tensor:
-        """Return L1 and SSIM in one kernel."""
-        return blitzgs.l1_ssim(renders, target, ssim_weight=self.options.ssim_lambda)
 
     def render(self, views: Any) -> tuple[Tensor, Any]:
         """Return the image of a view and what the strategy needs of it."""
@@ -148,13 +113,9 @@ class Gsplat(OneImport):
 ARMS = {"gsplat": Gsplat, "import": OneImport, "four": FourSwaps}
 
 
-def seconds_of(trainer: GsplatTrainer, until: int) -> float:
-    """Continue the training and return the seconds it took."""
-    synchronize(trainer.device)
-    start = time.perf_counter()
-    trainer.train_to(until)
-    synchronize(trainer.device)
-    return time.perf_counter() - start
+def seconds_until(trainer: GsplatTrainer, step: int) -> float:
+    """Continue the training to a step; returns the seconds it took."""
+    return seconds_of(trainer.device, lambda: trainer.train_to(step))
 
 
 def seconds_by_kind(trainer: GsplatTrainer, until: int) -> tuple[float, float]:
@@ -164,8 +125,8 @@ def seconds_by_kind(trainer: GsplatTrainer, until: int) -> tuple[float, float]:
     """
     every, ordinary, around = trainer._strategy.refine_every, 0.0, 0.0
     while trainer.step < until:
-        ordinary += seconds_of(trainer, min(-(-trainer.step // every) * every, until))
-        around += seconds_of(trainer, min(trainer.step + 2, until))
+        ordinary += seconds_until(trainer, min(-(-trainer.step // every) * every, until))
+        around += seconds_until(trainer, min(trainer.step + 2, until))
     return ordinary, around
 
 
@@ -190,8 +151,8 @@ def measure(name: str, capture: Any, images: ImageStore, options: argparse.Names
     trainer = ARMS[name]("default", GsplatOptions.of("default", choices), capture, images, device, 0)
     last = min(99, options.steps // 10)  # between two densifications
     ordinary, changes = seconds_by_kind(trainer, options.steps - last)
-    rest = seconds_of(trainer, options.steps)
-    found = {
+    rest = seconds_until(trainer, options.steps)
+    return {
         "arm": name,
         "loss": trainer.loss_name,
         "training, s": ordinary + changes + rest,
@@ -200,11 +161,9 @@ def measure(name: str, capture: Any, images: ImageStore, options: argparse.Names
         "Gaussians": len(trainer.params["means"]),
         "PSNR, dB": psnr(trainer, capture, images),
     }
-    return found
 
 
 def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
-    """Train with each arm in turn and report."""
     parser = make_parser(__doc__)
     parser.add_argument("capture", type=Path)
     parser.add_argument("--steps", type=int, default=7000)

@@ -16,9 +16,7 @@ from __future__ import annotations
 
 import argparse
 import statistics
-import time
 from collections import defaultdict
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,7 +24,7 @@ from typing import Any, cast
 
 import torch
 from bm_step import BEHIND, LOSS, OPTIONS, RATE, STEP, make_table, random_photographs
-from harness import make_parser, write_json
+from harness import make_parser, seconds_of, write_json
 from scenes import BenchmarkScene, aerial
 
 from blitzgs.config.fields import Config, OptimiserConfig
@@ -41,32 +39,6 @@ from blitzgs.table.table import GaussianTable
 from blitzgs.training.events import densify
 from blitzgs.training.state import TrainingState
 from blitzgs.training.step import Stepper
-
-
-class Measured:
-    """Seconds of the parts of events.
-
-    Attributes:
-        seconds: of each call, by the part's name.
-    """
-
-    def __init__(self, device: torch.device) -> None:
-        self._device = device
-        self.seconds: dict[str, list[float]] = defaultdict(list)
-
-    def time(self, name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        """Call a function, with the device idle before and after."""
-        _wait(self._device)
-        begin = time.perf_counter()
-        result = function(*args, **kwargs)
-        _wait(self._device)
-        self.seconds[name].append(time.perf_counter() - begin)
-        return result
-
-
-def _wait(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 def rows_of(scene: BenchmarkScene, ranks: Ranks) -> torch.Tensor:
@@ -151,21 +123,16 @@ class Events:
         """Return the median ms of a step; None with several ranks."""
         if self._batch is None:
             return None
-        measured = Measured(self.state.ranks.device)
+        seconds = []
         for _ in range(repeats):
             self.prepare()
-            measured.time("step", self._step)
-        return 1e3 * statistics.median(measured.seconds["step"][2:])
+            seconds.append(seconds_of(self.state.ranks.device, self._step))
+        return 1e3 * statistics.median(seconds[2:])
 
     def _step(self) -> None:
         assert self._batch is not None
         frame, terms, _ = self.state.stepper.forward(STEP + 1, OPTIONS, self._batch)
         self.state.stepper.backward(STEP + 1, frame, terms)
-
-
-def grows_by(config: Config, growth: float) -> Config:
-    """Return a configuration with another growth."""
-    return replace(config, population=replace(config.population, growth=growth))
 
 
 def slowest(ranks: Ranks, values: dict[str, float]) -> dict[str, float]:
@@ -188,13 +155,13 @@ def measure(millions: float, ranks: Ranks, args: argparse.Namespace) -> dict[str
     events.prepare_event()
     events.event()  # warms up, and sorts if this version sorts rarely
     result["step sorted"] = events.step_ms()
-    measured = Measured(ranks.device)
+    measured: dict[str, list[float]] = defaultdict(list)
     for growth in (0.05, 0.0):
-        state.config = grows_by(state.config, growth)
+        state.config = replace(state.config, population=replace(state.config.population, growth=growth))
         for _ in range(args.events):
             events.prepare_event()
             ranks.barrier()
-            measured.time(f"event, growth {growth:g}", events.event)
+            measured[f"event, growth {growth:g}"].append(seconds_of(ranks.device, events.event))
         result[f"step after growth {growth:g}"] = events.step_ms()
     result["rows"] = state.population()
     result["sorts"] = events.sorts
@@ -202,10 +169,10 @@ def measure(millions: float, ranks: Ranks, args: argparse.Namespace) -> dict[str
     densify.sort_rows = sort_rows  # keeps no table
     state.stepper.reindex()
     result["step sorted again"] = events.step_ms()
-    times = {name: 1e3 * statistics.median(seconds) for name, seconds in measured.seconds.items()}
-    times |= {f"mean {name}": 1e3 * statistics.mean(seconds) for name, seconds in measured.seconds.items()}
+    times = {name: 1e3 * statistics.median(seconds) for name, seconds in measured.items()}
+    times |= {f"mean {name}": 1e3 * statistics.mean(seconds) for name, seconds in measured.items()}
     result |= slowest(ranks, times)
-    result["each event"] = [round(1e3 * s, 2) for seconds in measured.seconds.values() for s in seconds]
+    result["each event"] = [round(1e3 * s, 2) for seconds in measured.values() for s in seconds]
     if ranks.device.type == "cuda":
         result["table_gb"], result["peak_gb"] = table_gb, torch.cuda.max_memory_allocated() / 1e9
     return result
@@ -213,7 +180,6 @@ def measure(millions: float, ranks: Ranks, args: argparse.Namespace) -> dict[str
 
 @torch.no_grad()
 def main() -> None:
-    """Measure all sizes; print tables, and write JSON when a file is named."""
     parser = make_parser(__doc__)
     parser.add_argument(
         "--millions", type=float, nargs="+", default=[1, 4, 12], help="Gaussians (%(default)s)"
@@ -230,8 +196,7 @@ def main() -> None:
                 f"{k} {v:.3f}" if isinstance(v, float) else f"{k} {v}" for k, v in result.items()
             )
             print(shown, flush=True)
-        if args.json:
-            write_json(args.json, args.device, results=results)
+        write_json(args.json, args.device, results=results)
     ranks.close()
 
 

@@ -30,10 +30,10 @@ import sys
 import time
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
-from harness import Clock, make_parser, write_json
+from harness import Clock, make_parser, torchrun, write_json
 from report_tables import exchange_lines
 from scenes import aerial
 
@@ -61,13 +61,8 @@ STAGES = (
 )  # fmt: skip
 
 
-class Inputs(NamedTuple):
-    """The Gaussians of all ranks, and the views."""
-
-    table: GaussianTable
-    options: RenderOptions
-    batches: list[tuple[list[int], Views]]
-    extent: float
+# The Gaussians of all ranks, and the views; the batches have the keys of their views; last the extent.
+Inputs = tuple[GaussianTable, RenderOptions, list[tuple[list[int], Views]], float]
 
 
 def capture_inputs(args: argparse.Namespace, device: torch.device) -> Inputs:
@@ -85,7 +80,7 @@ def capture_inputs(args: argparse.Namespace, device: torch.device) -> Inputs:
     chosen = [capture.train[k * len(capture.train) // count] for k in range(count)]
     groups = [chosen[i : i + args.batch] for i in range(0, len(chosen), args.batch)]
     options = render_options(Config(), space, 3)
-    return Inputs(table, options, [(group, views.pick(group)) for group in groups], space.extent)
+    return table, options, [(group, views.pick(group)) for group in groups], space.extent
 
 
 def aerial_inputs(args: argparse.Namespace, device: torch.device) -> Inputs:
@@ -97,24 +92,23 @@ def aerial_inputs(args: argparse.Namespace, device: torch.device) -> Inputs:
         for at in (slice(first, first + args.batch) for first in keys[:: args.batch])
     ]
     options = RenderOptions(sh_degree=3, near_plane=0.1, far_plane=1e6)
-    return Inputs(GaussianTable.create(scene.raw()), options, batches, 500.0)
+    return GaussianTable.create(scene.raw()), options, batches, 500.0
 
 
 class Workload:
     """This rank's share of the Gaussians, and steps of training over the batches."""
 
     def __init__(self, args: argparse.Namespace, ranks: Ranks) -> None:
-        inputs = capture_inputs(args, ranks.device) if args.data else aerial_inputs(args, ranks.device)
-        self.ranks, self.options, self.batches = ranks, inputs.options, inputs.batches
-        self.total, config = len(inputs.table), Config()
-        rows = torch.arange(ranks.rank, self.total, ranks.world_size, device=inputs.table.device)
+        inputs = capture_inputs if args.data else aerial_inputs
+        table, self.options, self.batches, extent = inputs(args, ranks.device)
+        self.ranks, self.total, config = ranks, len(table), Config()
+        rows = torch.arange(ranks.rank, self.total, ranks.world_size, device=table.device)
         if args.order == "morton":
-            rows = rows[morton_order(inputs.table["means"][rows])]
-        table = {name: inputs.table[name][rows].to(ranks.device) for name in inputs.table}
-        self.table = GaussianTable(table)
+            rows = rows[morton_order(table["means"][rows])]
+        self.table = GaussianTable({name: table[name][rows].to(ranks.device) for name in table})
         self.owners, self.guard, self.steps = TileOwners(ranks), LossGuard(), 0
         self.loss = config.loss
-        optimiser = TableAdam(config.optimiser, Schedule(config.schedule), inputs.extent, ranks.device)
+        optimiser = TableAdam(config.optimiser, Schedule(config.schedule), extent, ranks.device)
         self.stepper = Stepper(self.table, optimiser, self.owners, config.loss, 1.0)
         views = self.batches[0][1]
         shape = (len(views), views.height, views.width, 3)
@@ -246,15 +240,12 @@ def main() -> None:
         return
     reports = []
     for count in args.ranks:
-        torchrun = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}"]
-        done = subprocess.run(
-            [sys.executable, *torchrun, *sys.argv], stdout=subprocess.PIPE, text=True, check=True
-        )
+        command = [sys.executable, *torchrun(count), *sys.argv]
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
         line = next(text for text in done.stdout.splitlines() if text.startswith("REPORT "))
         reports.append(json.loads(line.removeprefix("REPORT ")))
         print("\n".join(exchange_lines({"results": reports})), flush=True)
-    if args.json:
-        write_json(args.json, args.device, results=reports)
+    write_json(args.json, args.device, results=reports)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ themselves at most, without pages of files; RUN may be a PLY file.
 from __future__ import annotations
 
 import dataclasses
-import json
 import subprocess
 import sys
 import tempfile
@@ -20,7 +19,7 @@ from pathlib import Path
 
 import psutil
 import torch
-from harness import make_parser
+from harness import make_parser, write_json
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -83,8 +82,7 @@ def main() -> int:
     args = parser.parse_args()
     if args.memory:
         rows = memory(args.run)
-        if args.json:
-            args.json.write_text(json.dumps(rows, indent=1) + "\n")
+        write_json(args.json, "cpu", memory=rows)
         return 0
     run = open_run(args.run)
     # Views without the gate of the levels, which most formats cannot hold.
@@ -121,9 +119,8 @@ def main() -> int:
                 }
             )
             print(rows[-1], flush=True)
-    result = {"gaussians": len(model), "sh_degree": model.sh_degree, "views": len(views), "formats": rows}
-    if args.json:
-        args.json.write_text(json.dumps(result, indent=1) + "\n")
+    about = {"gaussians": len(model), "sh_degree": model.sh_degree, "views": len(views)}
+    write_json(args.json, "cpu", **about, formats=rows)
     return 0
 
 

@@ -25,13 +25,13 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
 from typing import Any
 
 import torch
-from harness import make_parser, report, synchronize, write_json
+from harness import Clock, make_parser, report, synchronize, write_json
 from scenes import aerial
 
 from blitzgs import l1_ssim, rasterization, raw_rasterization
@@ -53,14 +53,9 @@ CALLS: dict[str, dict[str, Any]] = {
 def measure(
     device: str, repeats: int, views: int = 1, read_meta: bool = False, **options: Any
 ) -> list[float]:
-    """Return the median microseconds of the forward and of the backward pass.
+    """Return the median microseconds of the forward pass, with all of `meta` if it is read, and the backward.
 
-    Args:
-        device: where to render.
-        repeats: number of timed calls.
-        views: number of views.
-        read_meta: whether to read all entries of `meta`, as part of the forward pass.
-        options: further arguments of `rasterization`.
+    `options`: further arguments of `rasterization`.
     """
     scene = aerial(GAUSSIANS, device, views=views, width=WIDTH, height=HEIGHT)
     options = {"sh_degree": 1, **options}
@@ -83,65 +78,47 @@ def measure(
 
 
 class Trainer:
-    """A trainer of one view, as small as its host time allows.
-
-    Attributes:
-        params: the parameters by name.
-        seconds: of each part of the steps so far.
-    """
+    """A trainer of one view, as small as its host time allows."""
 
     def __init__(self, device: str, in_one: bool = False) -> None:
         """Take the Gaussians and the view of the benchmark's scene; `in_one`: one optimiser for all."""
         self._scene = scene = aerial(GAUSSIANS, device, width=WIDTH, height=HEIGHT)
-        values = {
-            "means": scene.means, "quats": scene.quats, "scales": scene.scales.log(),
-            "opacities": scene.opacities.logit(), "sh0": scene.sh[:, :1], "shN": scene.sh[:, 1:],
-        }  # fmt: skip
-        self.params = {
-            name: torch.nn.Parameter(value.detach().clone().contiguous()) for name, value in values.items()
-        }
+        values = scene.raw()
+        sh = values.pop("sh")
+        values |= {"sh0": sh[:, :1].contiguous(), "shN": sh[:, 1:].contiguous()}
+        self.params = {name: torch.nn.Parameter(value) for name, value in values.items()}
         groups = [{"params": [param], "name": name} for name, param in self.params.items()]
         self._optimizers = [LazyAdam(groups)] if in_one else [LazyAdam([group]) for group in groups]
         self._target = torch.full((1, HEIGHT, WIDTH, 3), 0.5, device=device)
-        self.seconds: dict[str, float] = defaultdict(float)
 
-    @contextlib.contextmanager
-    def part(self, name: str) -> Iterator[None]:
-        """Add the time of the block to a part of the steps."""
-        begin = time.perf_counter()
-        yield
-        self.seconds[name] += time.perf_counter() - begin
-
-    def step(self) -> None:
-        """Take a step."""
+    def step(self, end: Callable[[str], None] = lambda part: None) -> None:
+        """Take a step; `end` is called at the end of each part."""
         scene = self._scene
-        with self.part("render"):
-            image, _, _ = raw_rasterization(
-                *self.params.values(), scene.viewmats, scene.Ks, WIDTH, HEIGHT, sh_degree=1,
-                optimizers=self._optimizers,
-            )  # fmt: skip
-        with self.part("loss"):
-            loss = l1_ssim(image, self._target)
-        with self.part("backward"):
-            loss.backward()
-        with self.part("optimisers"):
-            for optimizer in self._optimizers:
-                optimizer.step()
-                optimizer.zero_grad()
+        image, _, _ = raw_rasterization(
+            *self.params.values(), scene.viewmats, scene.Ks, WIDTH, HEIGHT, sh_degree=1,
+            optimizers=self._optimizers,
+        )  # fmt: skip
+        end("render")
+        loss = l1_ssim(image, self._target)
+        end("loss")
+        loss.backward()
+        end("backward")
+        for optimizer in self._optimizers:
+            optimizer.step()
+            optimizer.zero_grad()
+        end("optimisers")
 
 
 def measure_trainer(device: str, repeats: int, in_one: bool) -> dict[str, float]:
     """Return the host's microseconds for each part of a trainer's step."""
-    trainer = Trainer(device, in_one)
-
-    def steps(count: int) -> None:
-        for _ in range(count):
-            trainer.step()
-
-    steps(repeats // 10 + 1)
-    trainer.seconds.clear()
-    steps(repeats)
-    found = {name: 1e6 * seconds / repeats for name, seconds in trainer.seconds.items()}
+    trainer, found = Trainer(device, in_one), defaultdict(float)
+    for _ in range(repeats // 10 + 1):
+        trainer.step()
+    clock = Clock("cpu")
+    for _ in range(repeats):
+        trainer.step(clock.mark)
+    for part, ms in clock.stages():
+        found[part] += 1e3 * ms / repeats
     return found | {"all": sum(found.values())}
 
 
@@ -189,7 +166,6 @@ def measure_training(device: str, repeats: int) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Measure all calls and the step; print tables and optionally write JSON."""
     args = make_parser(__doc__, repeats=500).parse_args()
     rows = []
     with torch.autograd.set_multithreading_enabled(False):
@@ -206,8 +182,7 @@ def main() -> None:
     report("Host time of a trainer's step", steps, None, args.device)
     training = measure_training(args.device, args.repeats)
     report("Host time of a training's step", training, None, args.device)
-    if args.json:
-        write_json(args.json, args.device, rows=rows, steps=steps, training=training)
+    write_json(args.json, args.device, rows=rows, steps=steps, training=training)
 
 
 if __name__ == "__main__":

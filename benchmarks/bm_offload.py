@@ -17,14 +17,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from bm_step import LOSS, OPTIONS, RATE, make_table
-from harness import make_parser, synchronize, write_json
+from harness import make_parser, seconds_of, write_json
 from report_tables import offload_lines
 from scenes import BenchmarkScene, aerial, look_at
 
@@ -101,19 +101,10 @@ class Survey:
                 frame, terms, _ = stepper.forward(step, OPTIONS, self.batch(order.batch(step - 1)))
                 stepper.backward(step, frame, terms)
 
-        return self.timed(take) / count
-
-    def timed(self, call: Callable[[], object]) -> float:
-        """Return the seconds of a call."""
-        synchronize(self.ranks.device)
-        begin = time.perf_counter()
-        call()
-        synchronize(self.ranks.device)
-        return time.perf_counter() - begin
+        return seconds_of(self.ranks.device, take) / count
 
 
 def table_bytes(table: GaussianTable) -> int:
-    """Return the bytes of all columns."""
     return sum(table[name].nbytes for name in table)
 
 
@@ -161,7 +152,7 @@ def measure_pool(
             "out_gb_per_s": moved.bytes_out / 1e9 / (seconds * steps),
             "blocks_in_view": moved.needed / steps,
         }
-        result["sweep_s"] = over.timed(lambda stepper=stepper, last=at - 1: stepper.catch_up(last))
+        result["sweep_s"] = seconds_of(over.ranks.device, partial(stepper.catch_up, at - 1))
     return results
 
 
@@ -170,9 +161,7 @@ def run(
 ) -> Iterator[dict[str, Any]]:
     """Measure all arms on one scene; yield the results so far after each pool."""
     scene = aerial(gaussians, device)
-    rows = morton_order(scene.means)
-    names = ("means", "quats", "scales", "opacities", "sh")
-    scene = replace(scene, **{name: getattr(scene, name)[rows] for name in names})
+    scene = scene.rows(morton_order(scene.means))
     over = Survey(scene, batch_size, device)
     table = make_table(scene)
     about = {"scene": scene.name, "batch_size": batch_size, "table_gb": table_bytes(table) / 1e9}
@@ -214,8 +203,7 @@ def main() -> None:
     with torch.no_grad():
         device = torch.device(args.device)
         for found in run(args.gaussians, args.ratios, args.orders, args.batch_size, args.steps, device):
-            if args.json:
-                write_json(args.json, args.device, **found)
+            write_json(args.json, args.device, **found)
     print(f"{found['scene']}, B = {args.batch_size}, table {found['table_gb']:.2f} GB")
     print("\n".join(offload_lines(found)))
     for row in found["results"]:

@@ -66,23 +66,14 @@ def popping_of(
 ) -> dict[str, Any]:
     """Measure the popping of a model.
 
-    Args:
-        model: the model in memory.
-        cameras: of its capture.
-        ranks: this process alone, with the device that renders the frames.
-        out: folder for popping.svg and popping.mp4; None: write nothing.
-        frames: number of frames of the flight, at least 2.
-        width: width of the frames in pixels, at most that of the camera.
-        camera: name of the view along whose axis the flight goes; None: the view closest to the mean axis.
+    `ranks`: this process alone. `out`: folder for popping.svg and popping.mp4; None: write nothing. `width`:
+    of the frames in pixels, at most that of the camera. `camera`: name of the view along whose axis the
+    flight goes; None: the view closest to the mean axis.
 
-    Returns:
-        "frames", "levels" (K), and for each of "full", "gated" and "smooth" a dictionary: "mean_change" and
-        "largest_change", and but for "full" "mean", "largest" and "pixel" of the popping, as above, and
-        "kept", the mean share of the Gaussians that a frame keeps.
-
-    Raises:
-        ValueError: there are fewer than 2 frames, no view of that name, or nothing in front of the camera.
-        OSError: the clip cannot be written.
+    Returns "frames", "levels" (K), and for each of "full", "gated" and "smooth" a dictionary: "mean_change"
+    and "largest_change", and but for "full" "mean", "largest" and "pixel" of the popping, as above, and
+    "kept", the mean share of the Gaussians that a frame keeps. ValueError: there are fewer than 2 frames, no
+    view of that name, or nothing in front of the camera. OSError: the clip cannot be written.
     """
     if frames < 2:
         raise ValueError(f"a flight has at least 2 frames, got {frames}")
@@ -207,17 +198,14 @@ def _flight(
 def _camera(cameras: Any, name: str | None) -> CameraLike:
     if name is None:
         axes = np.stack([camera.world_to_camera[2, :3] for camera in cameras])
-        chosen: CameraLike = cameras[int((axes @ axes.mean(0)).argmax())]
-        return chosen
+        return cameras[int((axes @ axes.mean(0)).argmax())]
     for camera in cameras:
         if camera.name == name:
-            found: CameraLike = camera
-            return found
+            return camera
     raise ValueError(f"the run has no view '{name}'; it has for example {cameras[0].name}")
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the benchmark."""
     parser = make_parser(__doc__)
     parser.add_argument("run", type=Path, help="folder of the run")
     parser.add_argument("--out", type=Path, help="folder for the chart and the clip (RUN/popping)")

@@ -41,10 +41,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
+import harness
 import quality_report
 import torch
-from harness import commit
-from quality_plan import STRESS_SEEDS, RunSpec, parse_named, runs_of, stress_markdown, stress_recipes
+from quality_plan import STRESS_SEEDS, RunSpec, end_of, parse_named, runs_of, stress_markdown, stress_recipes
 from quality_run import describe, write
 
 EVALUATE_AT = (1_000, 2_000, 4_000, 7_000, 10_000, 15_000, 20_000)
@@ -54,32 +54,27 @@ PRINT_EVERY = 60.0  # seconds between two lines about the present runs
 
 @dataclass
 class Job:
-    """A run and its process.
-
-    Attributes:
-        spec: the run.
-        slot: number of the run's slot, which decides its GPU.
-        process: process of the run.
-        log: file to which the process prints.
-    """
+    """A run and its process."""
 
     spec: RunSpec
-    slot: int
+    slot: int  # decides its GPU
     process: subprocess.Popen[bytes]
-    log: TextIO
+    log: TextIO  # to which the process prints
 
 
 class Pool:
-    """Runs trainings side by side, one in each slot.
+    """Runs trainings side by side, one in each slot."""
 
-    Attributes:
-        worker: program beside this file that does one run; it takes the paths of the run's SPEC and RESULT.
-    """
-
+    # Program beside this file that does one run; it takes the paths of the run's SPEC and RESULT.
     worker = "quality_run.py"
 
     def __init__(self, out: Path, gpus: int, per_gpu: int, ranks: int = 1) -> None:
-        """Make `per_gpu` slots for each group of `ranks` GPUs; without a GPU, `per_gpu` slots for the CPU."""
+        """Make `per_gpu` slots for each group of `ranks` GPUs; without a GPU, `per_gpu` slots for the CPU.
+
+        ValueError: there are too few GPUs, or several runs would share them.
+        """
+        if ranks > 1 and (per_gpu > 1 or 0 < gpus < ranks):
+            raise ValueError(f"--ranks {ranks} needs as many --gpus, and --per-gpu 1")
         self.out, self.gpus, self.per_gpu, self.ranks = out, gpus, per_gpu, ranks
         self.slots = list(range(max(gpus // ranks, 1) * per_gpu))
         self.jobs: list[Job] = []
@@ -99,7 +94,7 @@ class Pool:
             "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")])),
             "PYTHONUNBUFFERED": "1",
             "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", str(cores)),
-            "BLITZGS_COMMIT": commit(),
+            "BLITZGS_COMMIT": harness.commit(),
         }
         if self.gpus:
             visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
@@ -108,8 +103,7 @@ class Pool:
             environment["CUDA_VISIBLE_DEVICES"] = ",".join(visible[first : first + self.ranks])
         command = [sys.executable, str(worker), str(spec_path), str(self.result_path(spec))]
         if self.ranks > 1:
-            torchrun = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={self.ranks}"]
-            command[1:1] = torchrun
+            command[1:1] = harness.torchrun(self.ranks)
         process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
         self.jobs.append(Job(spec, slot, process, log))
 
@@ -145,10 +139,9 @@ class Pool:
         """Return a run's result as one line."""
         if result["status"] != "done":
             return f"FAILED: {result['error']}"
-        last = result["evaluations"][-1]
-        metrics = last.get("test", last.get("train"))
+        metrics, training = end_of(result), result["evaluations"][-1]["train"]
         return (
-            f"{metrics['psnr']:.2f} dB / {metrics['ssim']:.4f}, training views {last['train']['psnr']:.2f}, "
+            f"{metrics['psnr']:.2f} dB / {metrics['ssim']:.4f}, training views {training['psnr']:.2f}, "
             f"{result['seconds']:.1f} s, {result['gaussians']:,} Gaussians"
         )
 
@@ -169,6 +162,7 @@ def last_line(job: Job) -> str:
 
 def work(specs: Sequence[RunSpec], pool: Pool, minutes: float | None) -> None:
     """Train the runs that are not finished, and write the tables whenever one ends."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     left = [spec for spec in specs if not quality_report.is_done(pool.out, spec.name)]
     print(
         f"{len(specs)} runs, {len(specs) - len(left)} of them done before; {len(pool.slots)} at a time",
@@ -205,6 +199,15 @@ def work(specs: Sequence[RunSpec], pool: Pool, minutes: float | None) -> None:
         pool.stop()
 
 
+def train(specs: Sequence[RunSpec], pool: Pool, minutes: float | None) -> int:
+    """Do the work, and print the tables; returns the exit status: 1 when one of the runs has failed."""
+    work(specs, pool, minutes)
+    print(quality_report.report(pool.out))
+    wanted = {spec.name for spec in specs}
+    runs = quality_report.read_runs(pool.out / quality_report.RUNS)
+    return int(any(run["status"] != "done" and run["name"] in wanted for run in runs))
+
+
 def positive(text: str) -> int:
     """Read a number of at least 1."""
     value = int(text)
@@ -214,10 +217,7 @@ def positive(text: str) -> int:
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the command line's parser."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = harness.make_parser(__doc__, device=None, writes_json=False)
     parser.add_argument("--out", type=Path, required=True, metavar="RESULTS", help="folder of the results")
     parser.add_argument("--capture", action="append", default=[], metavar='"NAME=DIR [--data.FIELD=VALUE]"')
     parser.add_argument("--recipe", action="append", default=[], metavar='"NAME=SOURCE [--FIELD=VALUE]"')
@@ -255,7 +255,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark; returns the exit status: 1 when a planned run failed."""
     parser = make_parser()
     args = parser.parse_args(arguments)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
         captures, recipes = dict(map(parse_named, args.capture)), dict(map(parse_named, args.recipe))
         seeds, evaluate_at = args.seeds or [0], args.evaluate_at
@@ -268,19 +267,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if captures or recipes or args.collect is None:
             device = "cuda" if args.gpus > 0 else "cpu"
             specs = runs_of(captures, recipes, seeds, evaluate_at, args.lpips, device, args.ranks)
-            if args.ranks > 1 and (args.per_gpu > 1 or 0 < args.gpus < args.ranks):
-                raise ValueError(f"--ranks {args.ranks} needs as many --gpus, and --per-gpu 1")
+        pool = Pool(args.out, args.gpus, args.per_gpu, args.ranks)
     except (ValueError, OSError, re.error) as error:
         parser.error(str(error))
-    work(specs, Pool(args.out, args.gpus, args.per_gpu, args.ranks), args.minutes)
-    print(quality_report.report(args.out))
+    status = train(specs, pool, args.minutes)
     if args.stress is not None:
         table = stress_markdown(quality_report.read_runs(args.out / quality_report.RUNS))
         (args.out / "stress.md").write_text(table)
         print(table)
-    wanted = {spec.name for spec in specs}
-    failed = [r for r in quality_report.read_runs(args.out / quality_report.RUNS) if r["status"] != "done"]
-    return int(any(run["name"] in wanted for run in failed))
+    return status
 
 
 if __name__ == "__main__":

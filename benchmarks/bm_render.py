@@ -14,13 +14,12 @@ times; memory is the peak above the inputs.
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import torch
-from harness import Clock, make_parser, write_json
+from harness import make_parser, stage_medians, write_json
 from scenes import BenchmarkScene, aerial, garden_like
 from torch import Tensor
 
@@ -37,7 +36,6 @@ except ImportError:
 
 ops = torch.ops.blitzgs
 OPTIONS = RenderOptions(sh_degree=3, near_plane=0.01, far_plane=1e10)
-WARM_UP = 5
 # The stages by their marks in `blitzgs.frame.render`; the exchange of a single rank does nothing.
 STAGES = {
     "project": "project", "sort": "intersect", "raster": "rasterize", "raster back": "rasterize_backward",
@@ -117,45 +115,33 @@ class CallRender:
         del self.image, self.meta
 
 
-def event_times(steps: list[Callable[[], Any]], repeats: int) -> list[float]:
-    """Return the median ms of each step when they run in order."""
-    samples: list[list[float]] = [[] for _ in steps]
-    for repeat in range(WARM_UP + repeats):
-        events = [torch.cuda.Event(enable_timing=True) for _ in range(len(steps) + 1)]
-        events[0].record()
-        for step, event in zip(steps, events[1:], strict=True):
-            step()
-            event.record()
-        torch.cuda.synchronize()
-        if repeat >= WARM_UP:
-            for sample, begin, end in zip(samples, events, events[1:], strict=False):
-                sample.append(begin.elapsed_time(end))
-    return [statistics.median(sample) for sample in samples]
-
-
 def measure(render: OurRender | CallRender, v_renders: Tensor, repeats: int) -> dict[str, float]:
     """Return ms of forward, backward and both, and peak GB above what is allocated now."""
     torch.cuda.synchronize()
     torch.cuda.empty_cache()
     before = torch.cuda.memory_allocated()
     torch.cuda.reset_peak_memory_stats()
-    forward, backward = event_times([render.forward, lambda: render.backward(v_renders)], repeats)
+
+    def both(mark: Callable[[str], None]) -> None:
+        render.forward()
+        mark("forward")
+        render.backward(v_renders)
+        mark("backward")
+
+    (_, forward), (_, backward), _ = stage_medians(both, repeats)
     peak = (torch.cuda.max_memory_allocated() - before) / 1e9
     return {"forward": forward, "backward": backward, "total": forward + backward, "peak_gb": peak}
 
 
 def stages(render: OurRender, v_renders: Tensor, repeats: int) -> dict[str, float]:
     """Return ms of each stage. The host waits for the device only as a training step does."""
-    samples: dict[str, list[float]] = {stage: [] for stage in STAGES.values()}
-    for _ in range(WARM_UP + repeats):
-        clock = Clock()
-        with stages_told_to(clock.mark):
+
+    def both(mark: Callable[[str], None]) -> None:
+        with stages_told_to(mark):
             render.forward()
             render.backward(v_renders)
-        for stage, ms in clock.stages():
-            if stage in STAGES:
-                samples[STAGES[stage]].append(ms)
-    return {stage: statistics.median(sample[WARM_UP:]) for stage, sample in samples.items()}
+
+    return {STAGES[stage]: ms for stage, ms in stage_medians(both, repeats) if stage in STAGES}
 
 
 def run(name: str, repeats: int) -> dict[str, Any]:
@@ -192,7 +178,6 @@ def run(name: str, repeats: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measure the scenes asked for, print a table, optionally write JSON."""
     parser = make_parser(__doc__, device=None, repeats=30)
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
     args = parser.parse_args()
@@ -209,8 +194,7 @@ def main() -> None:
                       f"total {r['total']:7.3f} ms  peak {r['peak_gb']:.2f} GB  "
                       f"x{r['total'] / result['blitzgs']['total']:.2f}", flush=True)  # fmt: skip
         torch.cuda.empty_cache()
-    if args.json:
-        write_json(args.json, "cuda", results=results)
+    write_json(args.json, "cuda", results=results)
 
 
 if __name__ == "__main__":

@@ -12,14 +12,13 @@ scene, by default in Morton order, as the trainer keeps its table. Medians of CU
 
 from __future__ import annotations
 
-import statistics
-from dataclasses import replace
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import torch
 from bm_render import OPTIONS, CallRender
-from harness import Clock, make_parser, write_json
+from harness import make_parser, stage_medians, write_json
 from scenes import BenchmarkScene, aerial, garden_like
 
 from blitzgs.config.fields import LossConfig, OptimiserConfig, ScheduleConfig
@@ -36,7 +35,7 @@ from blitzgs.training.batches import Batch
 from blitzgs.training.step import Stepper
 
 LOSS = LossConfig(ssim=0.2, scale=0)
-STEP, RATE, BEHIND, WARM_UP = 2000, 1e-6, 40, 5
+STEP, RATE, BEHIND = 2000, 1e-6, 40
 GAUSSIANS = {"aerial1": 1_000_000, "aerial4": 4_000_000, "aerial16": 16_000_000}
 DRAWN_ROWS = 1 << 20  # rows whose moments are drawn at a time, so that a large table leaves room for them
 
@@ -49,9 +48,7 @@ def make_scene(name: str, views: int, order: str) -> BenchmarkScene:
         scene = aerial(GAUSSIANS[name], "cuda", views=views)
     if order == "random":  # the generated order is random
         return scene
-    rows = morton_order(scene.means)
-    columns = ("means", "quats", "scales", "opacities", "sh")
-    return replace(scene, **{column: getattr(scene, column)[rows] for column in columns})
+    return scene.rows(morton_order(scene.means))
 
 
 def random_photographs(scene: BenchmarkScene) -> Batch:
@@ -136,16 +133,12 @@ class GsplatStep:
 
 def measure(step: OurStep | GsplatStep, repeats: int) -> list[tuple[str, float]]:
     """Return name and median ms of each stage in order, last of the whole step."""
-    samples = []
-    for _ in range(WARM_UP + repeats):
-        step.prepare()
-        clock = Clock()
-        with stages_told_to(clock.mark):
+
+    def take(mark: Callable[[str], None]) -> None:
+        with stages_told_to(mark):
             step.take()
-        stages = clock.stages()
-        samples.append([*stages, ("total", sum(ms for _, ms in stages))])
-    columns = zip(*samples[WARM_UP:], strict=True)
-    return [(column[0][0], statistics.median(ms for _, ms in column)) for column in columns]
+
+    return stage_medians(take, repeats, step.prepare)
 
 
 def run(name: str, views: int, order: str, repeats: int) -> dict[str, Any]:
@@ -180,7 +173,6 @@ def run(name: str, views: int, order: str, repeats: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measure the scenes asked for, print the stages, and write them as JSON when a file is named."""
     parser = make_parser(__doc__, device=None, repeats=20)
     parser.add_argument(
         "--scenes", nargs="+", default=["aerial4", "aerial16"], choices=[*GAUSSIANS, "garden"]
@@ -189,8 +181,7 @@ def main() -> None:
     parser.add_argument("--order", default="morton", choices=["morton", "random"], help="of the rows")
     args = parser.parse_args()
     results = [run(name, args.views, args.order, args.repeats) for name in args.scenes]
-    if args.json:
-        write_json(args.json, "cuda", results=results)
+    write_json(args.json, "cuda", results=results)
 
 
 if __name__ == "__main__":

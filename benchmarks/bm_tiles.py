@@ -27,6 +27,7 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from blitzgs import rasterization
+from blitzgs.view.draw import intrinsics
 from blitzgs.viewer.world import looking
 from tests.helpers import read_glb
 
@@ -82,24 +83,14 @@ class City:
         return Tile(box[:3], np.diag(box[3:].reshape(3, 3)), node["geometricError"], children, rows, size)
 
     def chosen(
-        self,
-        pose: np.ndarray,
-        K: np.ndarray,
-        size: tuple[int, int],
-        pixels: float,  # noqa: N803
+        self, pose: np.ndarray, K: np.ndarray, size: tuple[int, int], pixels: float
     ) -> tuple[list[Tile], list[Tile]]:
         """Return the tiles that a view loads, as `tiles.js` chooses them; it shows those not refined."""
         axes, centre = pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
         (fx, _, cx), (_, fy, cy) = K[:2]
-        sides = np.stack(
-            [
-                axes[2],
-                fx * axes[0] + cx * axes[2],
-                -fx * axes[0] + (size[0] - cx) * axes[2],
-                fy * axes[1] + cy * axes[2],
-                -fy * axes[1] + (size[1] - cy) * axes[2],
-            ]
-        )
+        right, down, ahead = axes
+        across = fx * right + cx * ahead, -fx * right + (size[0] - cx) * ahead
+        sides = np.stack([ahead, *across, fy * down + cy * ahead, -fy * down + (size[1] - cy) * ahead])
         loaded, shown, waiting = [], [], [self.root]
         while waiting:
             tile = waiting.pop()
@@ -113,7 +104,7 @@ class City:
                 shown.append(tile)
         return loaded, shown
 
-    def render(self, rows: Tensor, pose: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> Tensor:  # noqa: N803
+    def render(self, rows: Tensor, pose: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> Tensor:
         """Render some of the Gaussians; float32 [H, W, 3] in [0, 1]."""
         view, device = self.view, self.means.device
         images, _, _ = rasterization(
@@ -127,25 +118,17 @@ class City:
 
 
 @torch.no_grad()
-def measure(
-    folder: Path,
-    device: str = "cpu",
-    frames: int = 12,
-    width: int = 1920,
-    errors: tuple[float, ...] = (4, 16, 64),
-) -> dict[str, Any]:
+def measure(folder: Path, device: str, frames: int, width: int, errors: tuple[float, ...]) -> dict[str, Any]:
     """Fly through a tileset.
 
-    Returns:
-        Numbers of Gaussians of the model and of all tiles, their bytes, and for each error and frame:
-        distance, tiles and Gaussians of the picture, those that it needs loaded, their bytes, those of the
-        flight so far, and PSNR in dB.
+    Returns numbers of Gaussians of the model and of all tiles, their bytes, and for each error and frame:
+    distance, tiles and Gaussians of the picture, those that it needs loaded, their bytes, those of the flight
+    so far, and PSNR in dB.
     """
     city = City(folder, torch.device(device))
     view, size = city.view, (width, width * 9 // 16)
     eye, target, up = (np.array(view[name]) for name in ("eye", "target", "up"))
-    focal = size[1] / 2 / math.tan(view["fov"] / 2)
-    K = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])  # noqa: N806
+    K = intrinsics(*size, view["fov"])
     everything = torch.arange(len(city), device=city.means.device)
     model = torch.cat([everything[rows] for rows in city.leaves])
     loaded: dict[float, dict[int, int]] = {error: {} for error in errors}
@@ -179,7 +162,6 @@ def measure(
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the benchmark."""
     parser = make_parser(__doc__)
     parser.add_argument("tiles", type=Path, help="folder of the tileset")
     parser.add_argument("--errors", type=float, nargs="+", default=[4.0, 16.0, 64.0], help="in pixels")

@@ -39,13 +39,10 @@ WARM_UP = 2.0
 
 def synthetic(count: int, device: str) -> Opened:
     """Return the synthetic aerial scene as a model to show; trained units of 1 km."""
-    columns = {name: column.float() for name, column in aerial(count, device).raw().items()}
-    unit = 1024.0
-    columns["means"] = columns["means"] / unit
-    columns["scales"] = columns["scales"] - float(np.log(unit))
-    order = morton_order(columns["means"])
-    for name in list(columns):
-        columns[name] = columns[name][order]
+    scene, unit = aerial(count, device), 1024.0
+    columns = scene.rows(morton_order(scene.means)).raw()
+    columns["means"] /= unit
+    columns["scales"] -= float(np.log(unit))
     table = GaussianTable.of_parameters(columns)
     space = Space((0.0, 0.0, 0.0), unit, 1.0)
     options = render_options(Config(), space, 3)
@@ -118,7 +115,6 @@ def served(opened: Opened, size: tuple[int, int], seconds: float, full: bool) ->
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the benchmark."""
     parser = make_parser(__doc__)
     parser.add_argument("--gaussians", type=int, default=12_000_000)
     parser.add_argument("--model", type=Path, help="a run or a PLY file instead of the synthetic scene")

@@ -48,17 +48,11 @@ Record = dict[str, Any]
 
 @dataclass(frozen=True)
 class CityRun(RunSpec):
-    """A run with its limits.
+    """A run with its limits."""
 
-    Attributes:
-        limit: seconds after which the process ends itself, whatever it does.
-        popping: number of frames of the flight after the evaluation, 0: none.
-        command: command of the benchmark that started the run.
-    """
-
-    limit: float = 100.0
-    popping: int = 0
-    command: str = ""
+    limit: float = 100.0  # seconds after which the process ends itself, whatever it does
+    popping: int = 0  # frames of the flight after the evaluation, 0: none
+    command: str = ""  # of the benchmark that started the run
 
 
 class CityTrainer(Trainer):
@@ -76,16 +70,10 @@ class CityTrainer(Trainer):
 def phases_of(config: Config, records: Sequence[Record], images: int, seconds: float) -> list[Record]:
     """Divide a run by what its schedule has on, from the records of its log.
 
-    Args:
-        config: of the run.
-        records: of the log.
-        images: that the run has seen.
-        seconds: of training until then.
-
-    Returns:
-        For each phase "from" and "to" in images, "on" (growth, LOD, mask), "seconds", "images_per_second" of
-        the whole phase, "median_images_per_second" between two records, "active" and "visible" (shares of the
-        Gaussians, means over the logged steps), and "gaussians" at its end.
+    `images` and `seconds` are those of the whole training. Returns for each phase "from" and "to" in images,
+    "on" (growth, LOD, mask), "seconds", "images_per_second" of the whole phase, "median_images_per_second"
+    between two records, "active" and "visible" (shares of the Gaussians, means over the logged steps), and
+    "gaussians" at its end.
     """
     schedule, view = config.schedule, config.view
     begins = schedule.t1 or schedule.t2
@@ -143,12 +131,8 @@ def _mean_share(records: Sequence[Record], name: str) -> float | None:
 def train(spec: CityRun, result: Record, path: Path, folder: Path, since: float) -> None:
     """Train, evaluate and, if planned, measure popping; add to the result, and write it after each part.
 
-    Args:
-        spec: the run.
-        result: gets the figures.
-        path: of the result's file, which rank 0 writes.
-        folder: for the run's log.
-        since: when the process began, by `time.monotonic`.
+    `path`: of the result's file, which rank 0 writes. `folder`: for the run's log. `since`: when the process
+    began, by `time.monotonic`.
     """
     config, laps = spec.config(), Laps()
     reading = read_ahead(config.data)

@@ -15,7 +15,6 @@ by one. Exit status: 0 if all ran and passed. `benchmarks/report.py` puts the re
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import signal
@@ -35,6 +34,8 @@ import torch
 NAME = "gpu_record.json"
 OLD = 200  # commits after which the record says little
 COUNTS = ("passed", "failed", "errors", "skipped")
+# What pytest's XML calls them; a test that failed may also have an error at its end.
+KINDS = {"error": "errors", "failure": "failed", "skipped": "skipped"}
 GRACE = 30  # seconds that an interrupted pytest has to write its results
 BENCHES = {
     "render": ("bm_render.py", "--scenes", "aerial1", "aerial4", "--repeats", "10"),
@@ -44,19 +45,15 @@ BENCHES = {
 
 @dataclass
 class Outcome:
-    """The tests of one entry of tests/.
-
-    Attributes:
-        state: "done"; "cut off" by the time limit; or "died": the process ended without results.
-        problems: name and first line of each failure and error.
-    """
+    """The tests of one entry of tests/."""
 
     passed: int = 0
     failed: int = 0
     errors: int = 0
     skipped: int = 0
     seconds: float = 0.0
-    state: str = "done"
+    state: str = "done"  # "cut off" by the time limit; or "died": the process ended without results
+    # Name and first line of each failure and error.
     problems: list[dict[str, str]] = field(default_factory=list)
 
     def add(self, other: Outcome) -> None:
@@ -74,17 +71,10 @@ def read_junit(path: Path) -> Outcome:
         if not case.get("name"):  # the test that an interrupt ended
             continue
         outcome.seconds += float(case.get("time", 0))
-        kind, problem = next(
-            (
-                (kind, found)
-                for kind in ("error", "failure", "skipped")
-                if (found := case.find(kind)) is not None
-            ),
-            ("passed", None),
-        )
-        count = {"error": "errors", "failure": "failed"}.get(kind, kind)
+        problem = next((found for kind in KINDS if (found := case.find(kind)) is not None), None)
+        count = "passed" if problem is None else KINDS[problem.tag]
         setattr(outcome, count, getattr(outcome, count) + 1)
-        if problem is not None and kind != "skipped":
+        if count in ("errors", "failed"):
             name = ".".join(filter(None, (case.get("classname"), case.get("name"))))
             reason = (problem.get("message") or "").split("\n")[0]
             if reason == "collection failure":  # the last line of the text says why
@@ -97,11 +87,8 @@ def read_junit(path: Path) -> Outcome:
 def run_pytest(target: Path, mark: str, folder: Path, end: float) -> Outcome:
     """Run a file or folder of tests.
 
-    Args:
-        target: the file or folder.
-        mark: the expression of pytest's -m.
-        folder: for the log and the results of pytest.
-        end: of `time.monotonic`; pytest is interrupted then, and writes what it has.
+    `mark`: the expression of pytest's -m. `folder`: for the log and the results of pytest. `end`: of
+    `time.monotonic`; pytest is interrupted then, and writes what it has.
     """
     name = "_".join(target.with_suffix("").parts[-2:])
     results = folder / f"{name}.xml"
@@ -183,11 +170,7 @@ def bench_rows(name: str, result: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def environment() -> dict[str, Any]:
-    """Return card, driver and versions.
-
-    Raises:
-        SystemExit: there is no CUDA device.
-    """
+    """Return card, driver and versions (SystemExit: there is no CUDA device)."""
     if not torch.cuda.is_available():
         raise SystemExit("gpu_record.py: torch finds no CUDA device here; run it on a machine with a GPU")
     found = harness.environment("cuda")
@@ -238,19 +221,10 @@ def make_record(
     longest: float = float("inf"),
     jobs: int = 1,
 ) -> bool:
-    """Fill the record until it is complete or the time is over.
+    """Fill the record, which is written after each step, until it is complete or the time is over.
 
-    Args:
-        record: is written after each step.
-        tests: folders or files of tests.
-        mark: the expression of pytest's -m.
-        folder: for logs.
-        end: of `time.monotonic`.
-        longest: seconds that an entry of the tests may take.
-        jobs: entries of the tests that run side by side.
-
-    Returns:
-        Whether all ran and passed.
+    `tests`: folders or files. `folder`: for logs. `end`: of `time.monotonic`. `longest`: seconds that an
+    entry of the tests may take. `jobs`: entries that run side by side. Returns whether all ran and passed.
     """
     for name in BENCHES:
         if not record.content["bench"].get(name) or "error" in record.content["bench"][name][0]:
@@ -263,15 +237,11 @@ def make_record(
             return Outcome(state="cut off")
         return run_pytest(target, mark, folder, min(end, time.monotonic() + longest))
 
+    def size(target: Path) -> int:
+        return sum(p.stat().st_size for p in (target, *target.rglob("test_*.py")))
+
     # The largest first, so that none runs alone in the end.
-    size = {
-        target: sum(p.stat().st_size for p in (target, *target.rglob("test_*.py")))
-        for target in entries(tests)
-    }
-    todo = {
-        f"{target.parent.name}/{target.stem}": target
-        for target in sorted(size, key=size.__getitem__, reverse=True)
-    }
+    todo = {f"{t.parent.name}/{t.stem}": t for t in sorted(entries(tests), key=size, reverse=True)}
     with ThreadPoolExecutor(jobs) as pool:
         names = {pool.submit(run, target): name for name, target in todo.items() if name not in rooms}
         for done in as_completed(names):
@@ -310,9 +280,7 @@ def age(path: Path) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Make a record or tell its age; returns the exit status."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = harness.make_parser(__doc__, device=None, writes_json=False)
     parser.add_argument("--out", type=Path, default=harness.ROOT / "benchmarks" / "results",
                         help="folder of gpu_record.json (%(default)s)")  # fmt: skip
     parser.add_argument("--commit", help="of these sources, where there is no .git")

@@ -7,7 +7,6 @@ A report is a Markdown table on stdout, and JSON with command, commit and machin
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import os
 import platform
@@ -17,13 +16,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import torch
 
 ROOT = Path(__file__).resolve().parents[1]
+WARM_UP = 5  # steps before those that count
 BEST_DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
 
@@ -46,13 +45,7 @@ def environment(device: torch.device | str = "cpu") -> dict[str, Any]:
 def gsplat_version() -> str | None:
     """Return the version of gsplat; None if this process has not imported it."""
     module = sys.modules.get("gsplat")
-    if module is None:
-        return None
-    with contextlib.suppress(
-        metadata.PackageNotFoundError
-    ):  # sources on PYTHONPATH are in no list of packages
-        return metadata.version("gsplat")
-    return str(getattr(module, "__version__", "of unknown version"))
+    return None if module is None else str(getattr(module, "__version__", "of unknown version"))
 
 
 def commit() -> str:
@@ -85,14 +78,13 @@ def command_line() -> str:
     return shlex.join(["python", *words])
 
 
-def write_json(path: Path, device: torch.device | str, **results: Any) -> None:
-    """Write the results of a benchmark as JSON, with what `benchmarks/report.py` has to know about them.
+def write_json(path: Path | None, device: torch.device | str, **results: Any) -> None:
+    """Write the results of a benchmark as JSON, with "command", "commit" and "environment" for `report.py`.
 
-    Args:
-        path: the file; its folder is made.
-        device: on which the benchmark ran.
-        results: what was measured, beside the keys "command", "commit" and "environment".
+    The folder is made. None: nothing is written. `device`: on which the benchmark ran.
     """
+    if path is None:
+        return
     path.parent.mkdir(parents=True, exist_ok=True)
     about = {"command": command_line(), "commit": commit(), "environment": environment(device)}
     path.write_text(json.dumps(about | results, indent=1) + "\n")
@@ -128,14 +120,16 @@ def markdown_table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def make_parser(
-    description: str | None, *, device: str | None = BEST_DEVICE, repeats: int | None = None
+    description: str | None,
+    *,
+    device: str | None = BEST_DEVICE,
+    repeats: int | None = None,
+    writes_json: bool = True,
 ) -> argparse.ArgumentParser:
-    """Return a parser of the options that benchmarks share.
+    """Return a parser of the options that benchmarks share; --help prints the description as it is written.
 
-    Args:
-        description: the docstring of the benchmark, which --help prints as it is written.
-        device: default of --device; None: the benchmark has no such option.
-        repeats: default of --repeats; None: the benchmark has no such option.
+    `device`, `repeats`: defaults of --device and --repeats; None: no such option. `writes_json`: whether
+    there is --json.
     """
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -144,7 +138,8 @@ def make_parser(
         parser.add_argument("--device", default=device)
     if repeats is not None:
         parser.add_argument("--repeats", type=int, default=repeats, help="timed runs (%(default)s)")
-    parser.add_argument("--json", type=Path, help="write the results, commit and machine to this file")
+    if writes_json:
+        parser.add_argument("--json", type=Path, help="write the results, commit and machine to this file")
     return parser
 
 
@@ -155,8 +150,7 @@ def report(
     info = environment(device)
     print(f"## {title}\n\n{', '.join(f'{key} {value}' for key, value in info.items())}\n")
     print(markdown_table(rows) + "\n")
-    if path is not None:
-        write_json(path, device, title=title, rows=list(rows))
+    write_json(path, device, title=title, rows=list(rows))
 
 
 def synchronize(device: torch.device | str) -> None:
@@ -165,33 +159,18 @@ def synchronize(device: torch.device | str) -> None:
         torch.cuda.synchronize(device)
 
 
-def median_ms(
-    function: Callable[..., Any], inputs: Sequence[tuple[Any, ...]], repeats: int = 30, warm_up: int = 5
-) -> float:
-    """Return the median milliseconds of ``function(*inputs[i])``, rotating among the input sets.
+def seconds_of(device: torch.device | str, call: Callable[[], object]) -> float:
+    """Return the seconds of a call by the host's clock, with the device idle before and after."""
+    synchronize(device)
+    begin = time.perf_counter()
+    call()
+    synchronize(device)
+    return time.perf_counter() - begin
 
-    The sets together must be larger than the last-level cache; otherwise the cache is measured.
-    """
-    cuda = any(torch.is_tensor(x) and x.is_cuda for x in _flatten(inputs))
-    for i in range(warm_up):
-        function(*inputs[i % len(inputs)])
-    times = []
-    for i in range(repeats):
-        arguments = inputs[i % len(inputs)]
-        if cuda:
-            start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-            # Keeps the device busy while the work is queued, so that there are no gaps between launches.
-            torch.cuda._sleep(200_000)
-            start.record()
-            function(*arguments)
-            end.record()
-            end.synchronize()
-            times.append(start.elapsed_time(end))
-        else:
-            begin = time.perf_counter()
-            function(*arguments)
-            times.append(1e3 * (time.perf_counter() - begin))
-    return statistics.median(times)
+
+def torchrun(ranks: int) -> list[str]:
+    """Return the arguments of Python that run the script which follows them on so many ranks of this host."""
+    return ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"]
 
 
 class Clock:
@@ -220,7 +199,22 @@ class Clock:
         ]
 
 
-def _flatten(value: Any) -> list[Any]:
-    if isinstance(value, list | tuple):
-        return [leaf for item in value for leaf in _flatten(item)]
-    return [value]
+def stage_medians(
+    step: Callable[[Callable[[str], None]], object],
+    repeats: int,
+    prepare: Callable[[], object] = lambda: None,
+    device: torch.device | str = "cuda",
+) -> list[tuple[str, float]]:
+    """Return name and median milliseconds of each stage, in order, last of the "total" of a step.
+
+    `step` gets a function, to be called with the name of each stage at its end. `prepare` is not timed.
+    """
+    samples = []
+    for _ in range(WARM_UP + repeats):
+        prepare()
+        clock = Clock(device)
+        step(clock.mark)
+        stages = clock.stages()
+        samples.append([*stages, ("total", sum(ms for _, ms in stages))])
+    columns = zip(*samples[WARM_UP:], strict=True)
+    return [(column[0][0], statistics.median(ms for _, ms in column)) for column in columns]

@@ -14,12 +14,14 @@ import hashlib
 import itertools
 import json
 import shlex
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
+from harness import markdown_table
 from opponents.gsplat_training import STRATEGIES, GsplatOptions
 
 from blitzgs.config.fields import Config
@@ -45,32 +47,20 @@ VALUES = {
 
 @dataclass(frozen=True)
 class RunSpec:
-    """One run, as it is passed to its process.
+    """One run, as it is passed to its process."""
 
-    Attributes:
-        capture: name of the capture.
-        data: overrides of the section `data`, including the path.
-        recipe: name of the recipe.
-        source: a YAML file, "defaults", "gsplat-" and one of gsplat's strategies, or
-            "partition-COLUMNSxROWS:" and a YAML file or "defaults".
-        overrides: "--section.field=value" of the configuration, or "--option=value" of the opponent.
-        seed: seed of the training.
-        evaluate_at: image counts at which held-out views are measured, in addition to the end.
-        lpips: TorchScript file, or None.
-        device: "cpu" or "cuda".
-        ranks: number of processes (and GPUs) that train together.
-    """
-
-    capture: str
-    data: list[str]
-    recipe: str
+    capture: str  # its name
+    data: list[str]  # overrides of the section `data`, including the path
+    recipe: str  # its name
+    # A YAML file, "defaults", "gsplat-" and one of gsplat's strategies, or "partition-COLUMNSxROWS:" and a
+    # YAML file or "defaults".
     source: str
-    overrides: list[str]
+    overrides: list[str]  # "--section.field=value" of the configuration, or "--option=value" of the opponent
     seed: int
-    evaluate_at: list[int]
-    lpips: str | None
+    evaluate_at: list[int]  # image counts at which held-out views are measured, in addition to the end
+    lpips: str | None  # TorchScript file
     device: str
-    ranks: int = 1
+    ranks: int = 1  # processes (and GPUs) that train together
 
     @property
     def strategy(self) -> str | None:
@@ -79,11 +69,7 @@ class RunSpec:
 
     @property
     def grid(self) -> tuple[int, int] | None:
-        """Columns and rows of a spatial partition; None where the whole scene is trained.
-
-        Raises:
-            ValueError: the source is not as it should be.
-        """
+        """Columns and rows of a spatial partition; None where the whole scene is trained."""
         if not self.source.startswith(PARTITION):
             return None
         shape = self.source.removeprefix(PARTITION).partition(":")[0].split("x")
@@ -124,11 +110,7 @@ class RunSpec:
 
 
 def parse_flags(flags: Iterable[str]) -> dict[str, Any]:
-    """Return {"option": value} of "--option=value" texts, the values read as YAML.
-
-    Raises:
-        ValueError: a text without "=".
-    """
+    """Return {"option": value} of "--option=value" texts, the values read as YAML."""
     values = {}
     for flag in flags:
         name, equals, value = flag.lstrip("-").partition("=")
@@ -139,11 +121,7 @@ def parse_flags(flags: Iterable[str]) -> dict[str, Any]:
 
 
 def parse_named(text: str) -> tuple[str, str]:
-    """Split "NAME=rest".
-
-    Raises:
-        ValueError: there is no name, or the name cannot be part of a file name.
-    """
+    """Split "NAME=rest" (ValueError: there is no name, or the name cannot be part of a file name)."""
     name, equals, rest = text.partition("=")
     if not equals or not name or not set(name) <= SAFE or not rest.strip():
         raise ValueError(f"'{text}': write NAME=..., with a name of letters, digits and _-+")
@@ -161,17 +139,8 @@ def runs_of(
 ) -> list[RunSpec]:
     """Return every run, checked; all recipes and captures of one seed come before the next seed.
 
-    Args:
-        captures: name -> "DIR [--data.field=value ...]".
-        recipes: name -> "SOURCE [--field=value ...]".
-        seeds: seeds of the trainings.
-        evaluate_at: see `RunSpec`.
-        lpips: TorchScript file, or None.
-        device: "cpu" or "cuda".
-        ranks: number of ranks of each run.
-
-    Raises:
-        ValueError: an argument is missing or cannot be used; the message names it.
+    `captures`: name -> "DIR [--data.field=value ...]". `recipes`: name -> "SOURCE [--field=value ...]". The
+    others are as in `RunSpec`. ValueError: an argument is missing or cannot be used; the message names it.
     """
     if not captures or not recipes or not seeds:
         raise ValueError("nothing to train: give at least one --capture, one --recipe and one seed")
@@ -218,10 +187,7 @@ def check(spec: RunSpec) -> None:
 def stress_recipes(source: str) -> dict[str, str]:
     """Return the grid's recipes, name -> source and overrides, the present values first.
 
-    Names have no dots: factors and schedules are in per cent.
-
-    Args:
-        source: configuration file whose values are changed.
+    Names have no dots: factors and schedules are in per cent. `source`: file whose values are changed.
     """
     config = load_config(source)
     changes = [("base", "")]
@@ -240,31 +206,33 @@ def stress_recipes(source: str) -> dict[str, str]:
 def stress_markdown(runs: Sequence[dict[str, Any]]) -> str:
     """Return the stress table: worst PSNR and largest fall over the seeds, and the loss against the column.
 
-    Args:
-        runs: results of `bm_quality.py --stress`; others are left out.
+    Runs that are not of the grid are left out.
     """
-    cells: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
+    cells: dict[tuple[str, str, str], list[dict[str, Any]]] = defaultdict(list)
     for run in runs:
         change, _, column = run["recipe"].partition("+")
         if run["status"] == "done" and column:
-            cells.setdefault((run["capture"], column, change), []).append(run)
-    worst = {key: min(_psnr(run) for run in group) for key, group in cells.items()}
-    lines = [
-        "| capture | schedule, batch | change | seeds | PSNR | below the column's best | largest fall |",
-        "|---|---|---|---|---|---|---|",
-    ]
+            cells[run["capture"], column, change].append(run)
+    worst = {key: min(end_of(run)["psnr"] for run in group) for key, group in cells.items()}
+    rows = []
     for (capture, column, change), group in sorted(cells.items()):
         best = max(value for key, value in worst.items() if key[:2] == (capture, column))
         psnr = worst[capture, column, change]
-        fall = max(run["largest_fall"] for run in group)
-        lines.append(
-            f"| {capture} | {column} | {change} | {len(group)} "
-            f"| {psnr:.2f} | {best - psnr:.2f} | {fall:.2f} |"
+        rows.append(
+            {
+                "capture": capture,
+                "schedule, batch": column,
+                "change": change,
+                "seeds": len(group),
+                "PSNR": f"{psnr:.2f}",
+                "below the column's best": f"{best - psnr:.2f}",
+                "largest fall": f"{max(run['largest_fall'] for run in group):.2f}",
+            }
         )
-    return "\n".join(lines) + "\n"
+    return markdown_table(rows) + "\n"
 
 
-def _psnr(run: dict[str, Any]) -> float:
+def end_of(run: dict[str, Any]) -> dict[str, Any]:
+    """Return the last metrics of a run: of its held-out views, or of all views if none is held out."""
     last = run["evaluations"][-1]
-    psnr: float = last.get("test", last.get("train"))["psnr"]
-    return psnr
+    return last.get("test", last.get("train"))

@@ -21,9 +21,7 @@ Group = tuple[str, str]  # capture, label of the recipe
 def read_runs(source: Path) -> list[Run]:
     """Return the runs in a folder of results, of its `runs` folder or of one collected JSON file.
 
-    Raises:
-        ValueError: a file holds something else.
-        OSError: the folder or file does not exist.
+    ValueError: a file holds something else. OSError: the folder or file does not exist.
     """
     if source.is_dir():
         inner = source / RUNS if (source / RUNS).is_dir() else source
@@ -55,11 +53,7 @@ def is_done(out: Path, name: str) -> bool:
 
 
 def report(out: Path) -> str:
-    """Write quality.json and quality.md into `out`.
-
-    Returns:
-        The Markdown.
-    """
+    """Write quality.json and quality.md into `out`; return the Markdown."""
     runs = read_runs(out / RUNS)
     text = markdown(runs)
     (out / "quality.json").write_text(json.dumps({"runs": runs}))
@@ -121,19 +115,15 @@ def table_rows(label: str, group: Sequence[Run]) -> list[dict[str, str]]:
     """Return a row for each image count at which every seed measured its training views, too."""
     counts = [{e["images"] for e in run["evaluations"] if "train" in e} for run in group]
     return [
-        table_row(label, images, [(run, evaluation_at(run, images)) for run in group])
+        table_row(label, [(run, e) for run in group for e in run["evaluations"] if e["images"] == images])
         for images in sorted(set.intersection(*counts))
     ]
 
 
-def evaluation_at(run: Run, images: int) -> dict[str, Any]:
-    """Return the evaluation of a run after so many images."""
-    return next(e for e in run["evaluations"] if e["images"] == images)
-
-
-def table_row(label: str, images: int, found: Sequence[tuple[Run, dict[str, Any]]]) -> dict[str, str]:
-    """Return the cells of some seeds at one image count."""
+def table_row(label: str, found: Sequence[tuple[Run, dict[str, Any]]]) -> dict[str, str]:
+    """Return the cells of some seeds, each with its evaluation at the same image count."""
     evaluations = [evaluation for _, evaluation in found]
+    images = evaluations[0]["images"]
     ends = [run for run, evaluation in found if evaluation["images"] == run["images"]]
     # A capture without held-out views is measured on its training views.
     split = "test" if all("test" in e for e in evaluations) else "train"

@@ -48,15 +48,7 @@ class Recorder:
     def __init__(
         self, spec: RunSpec, quoted: Sequence[int], end: int, capture: Any, device: torch.device
     ) -> None:
-        """Plan the evaluations.
-
-        Args:
-            spec: the run.
-            quoted: image counts at which the training views are measured, too.
-            end: number of images of the whole training.
-            capture: capture whose views are measured.
-            device: the device of the training.
-        """
+        """Plan the evaluations; training views are measured at the image counts `quoted` and `end`, too."""
         self.quoted = {images for images in quoted if images < end} | {end}
         self.marks = sorted({images for images in spec.evaluate_at if images < end} | self.quoted)
         self.evaluations: list[dict[str, Any]] = []
@@ -94,8 +86,7 @@ class Recorder:
 def means_of(metrics: dict[str, Any]) -> dict[str, float]:
     """Return the mean of each metric over the views.
 
-    Raises:
-        ValueError: no view can be measured, or the model is broken, and a mean is not finite.
+    ValueError: no view can be measured, or the model is broken, and a mean is not finite.
     """
     if not metrics["views"]:
         raise ValueError("nothing can be measured: all pixels of the views are masked")

@@ -13,15 +13,14 @@ names the command that makes it.
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import sys
 from pathlib import Path
 
+from harness import ROOT, make_parser
 from report_tables import SECTIONS, Json
 
-ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 PAGES = (*(ROOT / "docs" / name for name in ("performance.md", "city.md")), ROOT / "README.md")
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end: \2 -->)", re.DOTALL)
@@ -91,8 +90,7 @@ def group_of(name: str) -> tuple[str, ...]:
 def load_results(folder: Path = RESULTS) -> Results:
     """Read every result.
 
-    Raises:
-        ReportError: a file has no known name, does not name its commit, or is of several or another one.
+    ReportError: a file has no known name, does not name its commit, or is of several or another one.
     """
     results: Results = {}
     for path in sorted(folder.glob("*.json")):
@@ -153,11 +151,7 @@ def section_lines(name: str, results: Results) -> list[str]:
 
 
 def render_page(text: str, results: Results) -> str:
-    """Return a page with every table replaced.
-
-    Raises:
-        ReportError: the page names an unknown table.
-    """
+    """Return a page with every table replaced (ReportError: the page names an unknown table)."""
 
     def replace(match: re.Match[str]) -> str:
         if match[2] not in SECTIONS:
@@ -170,9 +164,7 @@ def render_page(text: str, results: Results) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Write or check the pages; returns the exit status."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, device=None, writes_json=False)
     parser.add_argument(
         "--check", action="store_true", help="change nothing; fail when a page is out of date"
     )

@@ -15,17 +15,11 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True)
 class Section:
-    """One table: the files that it needs, and the function that makes its lines.
+    """One table: the files that it needs, and the function that makes its lines."""
 
-    Attributes:
-        files: names in `COMMANDS`.
-        lines: takes the content of each file, in the order of `files`.
-        origin: whether lines with command, machine and commit follow.
-    """
-
-    files: tuple[str, ...]
-    lines: Callable[..., list[str]]
-    origin: bool = True
+    files: tuple[str, ...]  # names in `COMMANDS`
+    lines: Callable[..., list[str]]  # takes the content of each file, in the order of `files`
+    origin: bool = True  # whether lines with command, machine and commit follow
 
 
 QUALITY_COLUMNS = (

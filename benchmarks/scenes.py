@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic
+from blitzgs.formats.gaussians import SH_C0
+
 SH_COEFFICIENTS = 16  # degree 3
 
 
@@ -41,20 +42,14 @@ class BenchmarkScene:
             "opacities": torch.logit(self.opacities), "sh": self.sh,
         }  # fmt: skip
 
+    def rows(self, order: Tensor) -> BenchmarkScene:
+        """Return the scene with its Gaussians in another order, int64 [N]."""
+        names = ("means", "quats", "scales", "opacities", "sh")
+        return replace(self, **{name: getattr(self, name)[order] for name in names})
+
     def first_views(self, count: int) -> BenchmarkScene:
         """Return the scene seen by its first `count` cameras only."""
         return replace(self, viewmats=self.viewmats[:count], Ks=self.Ks[:count])
-
-    def centres_in_view(self) -> Tensor:
-        """Return, per view, the fraction of the means that project inside the image: float32 [B]."""
-        fractions = []
-        for viewmat, K in zip(self.viewmats, self.Ks, strict=True):
-            points = self.means @ viewmat[:3, :3].T + viewmat[:3, 3]
-            pixels = points[:, :2] / points[:, 2:] * K.diagonal()[:2] + K[:2, 2]
-            size = torch.tensor([self.width, self.height], device=pixels.device)
-            inside = ((pixels > 0) & (pixels < size)).all(1) & (points[:, 2] > 0)
-            fractions.append(inside.float().mean())
-        return torch.stack(fractions)
 
 
 def aerial(

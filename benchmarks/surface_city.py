@@ -11,15 +11,15 @@ SH coefficients that depend on the direction are noise, so that files have the b
 
 from __future__ import annotations
 
-import argparse
 import os
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from scenes import SH_C0
+from harness import make_parser
 
+from blitzgs.formats.gaussians import SH_C0
 from blitzgs.formats.ply import write_ply
 from blitzgs_synth.flight import View, plan_flight
 from blitzgs_synth.photographs import each
@@ -53,10 +53,7 @@ def turns_to(normals: Doubles) -> Doubles:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Make the model and write it."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, device=None, writes_json=False)
     parser.add_argument("file", type=Path)
     parser.add_argument("--preset", choices=PRESETS, default="city")
     parser.add_argument("--millions", type=float, default=12, help="about so many Gaussians (%(default)s)")

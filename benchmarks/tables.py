@@ -38,6 +38,7 @@ from pathlib import Path
 from typing import Any
 
 import bm_quality
+import harness
 import quality_report
 import tables_report
 import torch
@@ -61,15 +62,9 @@ def recipes_of(
 ) -> dict[str, str]:
     """Return the recipes of a table for `bm_quality.py`.
 
-    Args:
-        plan: the table's entry of `paper_tables.yaml`.
-        config: file that all arms start from, or "defaults".
-        gate: model file of a spawn gate, or None.
-        flags: flags of all arms; those of an arm follow them.
-        arms: names of the arms; None: all.
-
-    Raises:
-        ValueError: the table has no such arm.
+    `plan`: the table's entry of `paper_tables.yaml`. `config`: file that all arms start from, or "defaults".
+    `gate`: model file of a spawn gate. `flags`: of all arms; those of an arm follow them. `arms`: their
+    names; None: all. ValueError: the table has no such arm.
     """
     known = [*plan["arms"], *plan.get("opponents", {})]
     if arms is not None and (unknown := sorted(set(arms) - set(known))):
@@ -95,39 +90,25 @@ def recipes_of(
 def train(table: str, plan: dict[str, Any], args: argparse.Namespace, scenes: dict[str, str]) -> int:
     """Train the runs of a table that are not finished; returns the exit status."""
     recipes = recipes_of(plan, args.config, args.gate, args.flags, args.arms)
-    common = ["--out", str(args.out), "--gpus", str(args.gpus), "--evaluate-at"]
-    common += ["--seeds", *map(str, args.seeds)]
-    for name, text in scenes.items():
-        common += ["--capture", f"{name}={text}"]
-    for name, text in recipes.items():
-        common += ["--recipe", f"{name}={text}"]
-    for flag in ("lpips", "minutes", "per_gpu"):
-        if (value := getattr(args, flag)) is not None:
-            common += [f"--{flag.replace('_', '-')}", str(value)]
-    status = 0
+    device, status = "cuda" if args.gpus > 0 else "cpu", 0
     for ranks in args.ranks if table == "scaling" else [1]:
+        specs = runs_of(scenes, recipes, args.seeds, [], args.lpips, device, ranks)
         if args.dry_run:
-            device = "cuda" if args.gpus > 0 else "cpu"
-            for spec in runs_of(scenes, recipes, args.seeds, [], args.lpips, device, ranks):
+            for spec in specs:
                 state = "finished" if quality_report.is_done(args.out, spec.name) else "to run"
                 print(f"{state}: {spec.name}: {' '.join([spec.source, *spec.overrides])}")
         else:
-            status |= bm_quality.main([*common, "--ranks", str(ranks)])
+            pool = bm_quality.Pool(args.out, args.gpus, args.per_gpu, ranks)
+            status |= bm_quality.train(specs, pool, args.minutes)
     return status
-
-
-def result_path(table: str, args: argparse.Namespace, scene: str) -> Path:
-    """Return the path of a scene's result for tables that `bm_quality.py` does not train."""
-    if table == "oracle":
-        return Path(args.out / f"oracle.{scene}" / "replay.json")
-    return Path(args.out / f"{table}.{scene}.json")
 
 
 def measure(table: str, args: argparse.Namespace, scenes: dict[str, str]) -> None:
     """Run the other benchmark that a table is made of, for the scenes that have no result."""
     device = "cuda" if args.gpus > 0 else "cpu"
     for scene, text in scenes.items():
-        path = result_path(table, args, scene)
+        # `blitzgs gate replay` writes a folder.
+        path = args.out / (f"oracle.{scene}/replay.json" if table == "oracle" else f"{table}.{scene}.json")
         command = [sys.executable]
         if table == "cost":
             folder, *fields = shlex.split(text)
@@ -167,11 +148,7 @@ def read_results(table: str, out: Path) -> dict[str, Any]:
 
 
 def tabulate(table: str, plan: dict[str, Any], out: Path) -> str:
-    """Write the table of all results in a folder; returns its Markdown.
-
-    Raises:
-        ValueError: there are none.
-    """
+    """Write the table of all results in a folder; returns its Markdown (ValueError: there are none)."""
     reference, parts = plan.get("reference", []), []
     rows: list[dict[str, Any]] = []
     if table in TRAINED:
@@ -200,10 +177,7 @@ def tabulate(table: str, plan: dict[str, Any], out: Path) -> str:
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the command line's parser."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = harness.make_parser(__doc__, device=None, writes_json=False)
     parser.add_argument("table", choices=TABLES)
     parser.add_argument("--out", type=Path, required=True, metavar="TABLES", help="folder of the results")
     parser.add_argument("--scenes", nargs="+", default=[], metavar='"NAME=DIR [--data.FIELD=VALUE]"')
@@ -219,7 +193,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--gpus", type=int, default=gpus, metavar="N", help="to use; 0: the CPU (%(default)s)"
     )
-    parser.add_argument("--per-gpu", type=bm_quality.positive, metavar="N", help="as for bm_quality.py")
+    parser.add_argument("--per-gpu", type=bm_quality.positive, default=1, metavar="N", help="runs on each")
     parser.add_argument(
         "--ranks", type=bm_quality.positive, nargs="+", default=[1, 2, 4], help="of scaling and cost"
     )

@@ -12,17 +12,12 @@ from typing import Any
 
 from harness import markdown_table
 from opponents.spatial_partition import makespan
+from quality_plan import end_of
 from quality_report import Run, labels, spread
 
 Row = dict[str, Any]
 Worst = Callable[[Iterable[float]], float]
 PAPER_GPUS = 4  # number of GPUs on which the paper trained its blocks
-
-
-def _end(run: Run) -> dict[str, float]:
-    last: dict[str, Any] = run["evaluations"][-1]
-    found: dict[str, float] = last.get("test", last.get("train"))
-    return found
 
 
 def _mean_memory(run: Run) -> float | None:
@@ -33,10 +28,10 @@ def _mean_memory(run: Run) -> float | None:
 # Columns of a finished run: name, value (None: not measured), format, and the function that picks the worst
 # seed.
 FIGURES: tuple[tuple[str, Callable[[Run], float | None], str, Worst], ...] = (
-    ("PSNR", lambda run: _end(run)["psnr"], "{:.2f}", min),
-    ("corrected PSNR", lambda run: _end(run).get("psnr_corrected"), "{:.2f}", min),
-    ("SSIM", lambda run: _end(run)["ssim"], "{:.4f}", min),
-    ("LPIPS", lambda run: _end(run).get("lpips"), "{:.4f}", max),
+    ("PSNR", lambda run: end_of(run)["psnr"], "{:.2f}", min),
+    ("corrected PSNR", lambda run: end_of(run).get("psnr_corrected"), "{:.2f}", min),
+    ("SSIM", lambda run: end_of(run)["ssim"], "{:.4f}", min),
+    ("LPIPS", lambda run: end_of(run).get("lpips"), "{:.4f}", max),
     ("images/s", lambda run: run["images_per_second"], "{:.0f}", min),
     ("seconds", lambda run: run["seconds"], "{:.1f}", max),
     ("peak M", lambda run: run["peak_gaussians"] / 1e6, "{:.3f}", max),
@@ -49,9 +44,7 @@ FIGURES: tuple[tuple[str, Callable[[Run], float | None], str, Worst], ...] = (
 def arm_rows(runs: Sequence[Run], arms: dict[str, dict[str, Any]]) -> tuple[list[Row], list[Row]]:
     """Return a row for each capture, arm and number of ranks: as text, and as numbers for the CSV file.
 
-    Args:
-        runs: finished runs.
-        arms: name of the recipe -> its "title" and, where the paper has it, its row in "paper".
+    `arms`: name of the recipe -> its "title" and, where the paper has it, its row in "paper".
     """
     groups: dict[tuple[str, int, int, str], list[Run]] = defaultdict(list)
     order, label = list(arms), labels(runs)
@@ -184,17 +177,10 @@ def popping_rows(scene: str, found: dict[str, Any]) -> list[Row]:
 
 
 def write(out: Path, table: str, source: str, parts: Sequence[tuple[str, list[Row]]], rows: list[Row]) -> str:
-    """Write TABLE.md and TABLE.csv into a folder.
+    """Write TABLE.md and TABLE.csv into a folder; returns the Markdown.
 
-    Args:
-        out: the folder.
-        table: name of both files.
-        source: place of the figures in the paper.
-        parts: title and rows of each table of the Markdown; those without rows are left out.
-        rows: rows of the CSV file.
-
-    Returns:
-        The Markdown.
+    `source`: place of the figures in the paper. `parts`: title and rows of each table of the Markdown; those
+    without rows are left out. `rows`: of the CSV file.
     """
     text = [f"# {table}\n", f"Medians over the seeds, the worst in brackets. Paper: {source}.\n"]
     text += [f"## {title}\n\n{markdown_table(part)}\n" for title, part in parts if part]

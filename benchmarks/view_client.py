@@ -12,6 +12,7 @@ import msgspec.msgpack
 import numpy as np
 import websockets.exceptions
 import zstandard
+from viser.transforms import SO3
 from websockets.sync.client import connect
 
 # As often as viser's page sends a moving camera.
@@ -26,16 +27,10 @@ def camera_message(angle: float, radius: float, height: float, middle: list[floa
     right = np.cross(forward, [0, 0, 1.0])
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward], axis=1)
-    w = math.sqrt(max(1e-12, 1 + np.trace(rotation))) / 2
-    x, y, z = (
-        rotation[2, 1] - rotation[1, 2],
-        rotation[0, 2] - rotation[2, 0],
-        rotation[1, 0] - rotation[0, 1],
-    )
     return msgspec.msgpack.encode(
         {
             "type": "ViewerCameraMessage",
-            "wxyz": [float(value) for value in (w, x / (4 * w), y / (4 * w), z / (4 * w))],
+            "wxyz": SO3.from_matrix(rotation).wxyz.tolist(),
             "position": place.tolist(),
             "image_height": size[1],
             "image_width": size[0],
@@ -79,11 +74,8 @@ def main() -> None:
             if now >= sent:
                 sent = max(sent + 1 / CAMERAS_A_SECOND, now)
                 angle = 0.3 * (now - begin)
-                socket.send(
-                    camera_message(
-                        angle, options["radius"], options["height"], options["middle"], options["size"]
-                    )
-                )
+                place = (options[name] for name in ("radius", "height", "middle", "size"))
+                socket.send(camera_message(angle, *place))
             try:
                 message = socket.recv(timeout=max(0.0, min(end, sent) - time.monotonic()))
             except TimeoutError:

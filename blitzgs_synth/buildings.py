@@ -20,6 +20,7 @@ from blitzgs_synth.mesh import (
     Color,
     Look,
     MeshBuilder,
+    Point,
 )
 from blitzgs_synth.plan import Rectangle
 
@@ -58,8 +59,8 @@ CONCRETE: Final = Look(PLAIN, (0.52, 0.51, 0.48))
 STEEL: Final = Look(METAL, (0.56, 0.58, 0.60))
 
 
-def _pick(colors: list[Color], rng: Rng) -> Color:
-    r, g, b = np.array(colors[int(rng.integers(len(colors)))]) * rng.uniform(0.88, 1.08)
+def _pick(colors: list[Color], rng: Rng, darkest: float = 0.88, lightest: float = 1.08) -> Color:
+    r, g, b = np.array(colors[int(rng.integers(len(colors)))]) * rng.uniform(darkest, lightest)
     return (float(r), float(g), float(b))
 
 
@@ -126,26 +127,23 @@ def gable_roof(
     """Add two tiled slopes with their gables and a chimney; the ridge runs along x or along y."""
     x0, y0, x1, y1 = rectangle
     tiles = tiles or Look(TILES, _pick(_ROOF_TILES, rng), _seed(rng), float(rng.random() < 0.35))
-    eave = 0.45
-    drop = rise * eave / ((y1 - y0 if along_x else x1 - x0) / 2)
+    # u along the ridge and v across it; `at` gives a point in x and y.
+    (u0, u1), (v0, v1) = ((x0, x1), (y0, y1)) if along_x else ((y0, y1), (x0, x1))
+
+    def at(u: float, v: float, height: float) -> Point:
+        return (u, v, height) if along_x else (v, u, height)
+
+    eave, middle = 0.45, (v0 + v1) / 2
+    low, top = z - rise * eave / ((v1 - v0) / 2), z + rise
     gable = Look(PLAIN, wall.color, wall.seed)
-    low, top = z - drop, z + rise
-    if along_x:
-        middle = (y0 + y1) / 2
-        for ya, yb, sign in ((y0 - eave, middle, 1), (y1 + eave, middle, -1)):
-            xa, xb = (x0 - eave, x1 + eave) if sign > 0 else (x1 + eave, x0 - eave)
-            b.quad((xa, ya, low), (xb, ya, low), (xb, yb, top), (xa, yb, top), tiles)
-        b.quad((x1, y0, z), (x1, y1, z), (x1, middle, top), (x1, middle, top), gable)
-        b.quad((x0, y1, z), (x0, y0, z), (x0, middle, top), (x0, middle, top), gable)
-    else:
-        middle = (x0 + x1) / 2
-        for xa, xb, sign in ((x0 - eave, middle, -1), (x1 + eave, middle, 1)):
-            ya, yb = (y1 + eave, y0 - eave) if sign < 0 else (y0 - eave, y1 + eave)
-            b.quad((xa, ya, low), (xa, yb, low), (xb, yb, top), (xb, ya, top), tiles)
-        b.quad((x0, y0, z), (x1, y0, z), (middle, y0, top), (middle, y0, top), gable)
-        b.quad((x1, y1, z), (x0, y1, z), (middle, y1, top), (middle, y1, top), gable)
-    cx = x0 + (x1 - x0) * rng.uniform(0.25, 0.75) if along_x else (x0 + x1) / 2 + 0.8
-    cy = (y0 + y1) / 2 + 0.8 if along_x else y0 + (y1 - y0) * rng.uniform(0.25, 0.75)
+    # Swapped axes turn corners round the other way.
+    near, far = (u0, u1) if along_x else (u1, u0)
+    begin, end = (u0 - eave, u1 + eave) if along_x else (u1 + eave, u0 - eave)
+    for v, a, c in ((v0 - eave, begin, end), (v1 + eave, end, begin)):
+        b.quad(at(a, v, low), at(c, v, low), at(c, middle, top), at(a, middle, top), tiles)
+    for u, va, vb in ((far, v0, v1), (near, v1, v0)):
+        b.quad(at(u, va, z), at(u, vb, z), at(u, middle, top), at(u, middle, top), gable)
+    cx, cy, _ = at(u0 + (u1 - u0) * rng.uniform(0.25, 0.75), middle + 0.8, 0)
     brick = Look(PLAIN, (0.38, 0.2, 0.14), _seed(rng))
     b.box(cx - 0.4, cy - 0.4, cx + 0.4, cy + 0.4, z + rise * 0.4, top + 0.8, brick, CONCRETE)
 
@@ -256,12 +254,7 @@ def church(b: MeshBuilder, block: Rectangle, rng: Rng) -> None:
     gable_roof(b, nave, 8.0, 5.0, stone, rng, along_x=True, tiles=slate)
     x, s, z = cx - 12.0, 3.0, 19.0
     b.walls(x - s, cy - s, x + s, cy + s, 0, z, stone)
-    e = s + 0.4
-    copper = Look(METAL, (0.26, 0.42, 0.36), _seed(rng))
-    apex = (x, cy, z + 11.0)
-    corners = [(x - e, cy - e, z), (x + e, cy - e, z), (x + e, cy + e, z), (x - e, cy + e, z)]
-    for a, c in zip(corners, corners[1:] + corners[:1], strict=True):
-        b.quad(a, c, apex, apex, copper)
+    b.pyramid(x, cy, s + 0.4, z, z + 11.0, Look(METAL, (0.26, 0.42, 0.36), _seed(rng)))
 
 
 def shops(b: MeshBuilder, block: Rectangle, rng: Rng) -> Rectangle:
@@ -300,8 +293,7 @@ def tree(b: MeshBuilder, x: float, y: float, height: float, rng: Rng) -> None:
     """Add a tree: a trunk and a crown of a few bumpy blobs, or a slim conifer now and then."""
     t = 0.03 * height + 0.06
     b.walls(x - t, y - t, x + t, y + t, 0, 0.5 * height, _BARK)
-    r, g, blue = np.array(_LEAVES[int(rng.integers(len(_LEAVES)))]) * rng.uniform(0.8, 1.25)
-    color = (float(r), float(g), float(blue))
+    color = _pick(_LEAVES, rng, 0.8, 1.25)
 
     def look() -> Look:
         return Look(LEAVES, color, float(rng.uniform(0, 6)))
@@ -346,8 +338,7 @@ def hedge(b: MeshBuilder, x0: float, y0: float, x1: float, y1: float, rng: Rng) 
 
 def car(b: MeshBuilder, x: float, y: float, rng: Rng, *, along_x: bool) -> None:
     """Add a car centred at x, y."""
-    r, g, blue = np.array(_PAINTS[int(rng.integers(len(_PAINTS)))])
-    paint = Look(PAINT, (float(r), float(g), float(blue)))
+    paint = Look(PAINT, _PAINTS[int(rng.integers(len(_PAINTS)))])
     glass = Look(PAINT, (0.03, 0.035, 0.045))
     length, width = float(rng.uniform(3.9, 4.8)), float(rng.uniform(1.7, 1.9))
     ahead = float(rng.choice([-0.2, 0.2]))
@@ -365,12 +356,4 @@ def kiosk(b: MeshBuilder, x: float, y: float, rng: Rng) -> None:
     """Add a small pavilion with a pyramid roof."""
     wall = Look(PLAIN, (0.75, 0.72, 0.65))
     b.walls(x - 2, y - 2, x + 2, y + 2, 0, 2.8, wall)
-    roof = Look(TILES, (0.30, 0.12, 0.08), float(rng.integers(1, 1000)))
-    corners = [
-        (x - 2.6, y - 2.6, 2.7),
-        (x + 2.6, y - 2.6, 2.7),
-        (x + 2.6, y + 2.6, 2.7),
-        (x - 2.6, y + 2.6, 2.7),
-    ]
-    for a, c in zip(corners, corners[1:] + corners[:1], strict=True):
-        b.quad(a, c, (x, y, 4.6), (x, y, 4.6), roof)
+    b.pyramid(x, y, 2.6, 2.7, 4.6, Look(TILES, (0.30, 0.12, 0.08), float(rng.integers(1, 1000))))

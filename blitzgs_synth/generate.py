@@ -11,7 +11,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -241,27 +241,6 @@ def _mean_errors(views: list[View], cloud: Cloud, starts: Ints, lengths: Ints) -
     return mean
 
 
-_HELP = {
-    "extent": "edge of the built-up square, metres",
-    "views": "number of images",
-    "width": "image width, pixels",
-    "height": "image height, pixels",
-    "points_per_view": "number of feature points to search for in each image",
-    "oblique": "fraction of oblique views, 0 to 1",
-    "seed": "seed of all random choices",
-    "built": "a city; --no-built: flat farmland",
-    "grain": "noise of the photographs, in steps of 8-bit values",
-    "exposure": "standard deviation of the logarithm of the photographs' gains",
-    "altitudes": "number of heights flown at, 1 to 8",
-}
-
-
-def _sizes() -> str:
-    return "; ".join(
-        f"{name}, {city.views:,} views of {city.width} x {city.height}" for name, city in PRESETS.items()
-    )
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of `blitzgs synth` to a parser."""
     parser.add_argument(
@@ -270,23 +249,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder to create; if it has a part of the same city, only the rest is made",
     )
+    sizes = (f"{name}, {o.views:,} views of {o.width} x {o.height}" for name, o in PRESETS.items())
     parser.add_argument(
         "--preset",
         choices=PRESETS,
         default="demo",
-        help=f"city that the other flags change (default: %(default)s): {_sizes()}",
+        help=f"city that the other flags change (default: %(default)s): {'; '.join(sizes)}",
     )
     for field in fields(CityOptions):
-        flag = f"--{field.name.replace('_', '-')}"
-        if isinstance(field.default, bool):
-            parser.add_argument(flag, action=argparse.BooleanOptionalAction, help=_HELP[field.name])
-            continue
-        parser.add_argument(
-            flag,
-            type=type(field.default),
-            metavar="N" if isinstance(field.default, int) else "X",
-            help=_HELP[field.name],
-        )
+        flag, kind = f"--{field.name.replace('_', '-')}", type(field.default)
+        how: dict[str, Any] = {"type": kind, "metavar": "N" if kind is int else "X"}
+        if kind is bool:
+            how = {"action": argparse.BooleanOptionalAction}
+        parser.add_argument(flag, help=field.metadata["help"], **how)
     parser.add_argument(
         "--processes", type=int, metavar="N", help="number of processes (default: one for each core)"
     )
@@ -297,19 +272,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Generate the city; returns the exit status. Raises what `generate_city` raises."""
-    preset = PRESETS[args.preset]
-    chosen = {}
-    for field in fields(CityOptions):
-        value = getattr(args, field.name)
-        chosen[field.name] = getattr(preset, field.name) if value is None else value
+    given = {field.name: getattr(args, field.name) for field in fields(CityOptions)}
+    chosen = asdict(PRESETS[args.preset]) | {name: v for name, v in given.items() if v is not None}
     started = time.monotonic()
     with image_progress("Photographing the city") as progress:
         out = generate_city(
-            args.out,
-            **chosen,
-            processes=args.processes,
-            overwrite=args.overwrite,
-            progress=progress,
+            args.out, **chosen, processes=args.processes, overwrite=args.overwrite, progress=progress
         )
     size = f"{chosen['views']} images of {chosen['width']} x {chosen['height']}"
     print(f"{out}: {size}, {time.monotonic() - started:.1f} s")

@@ -110,12 +110,7 @@ def _street(
 
 
 def _markings(
-    across: Floats,
-    along: Floats,
-    to_junction: Floats,
-    streets: Streets,
-    index: Ints,
-    footprint: Floats,
+    across: Floats, along: Floats, to_junction: Floats, streets: Streets, index: Ints, footprint: Floats
 ) -> Floats:
     main, half = streets.main[index], streets.halves[index]
     approach = to_junction < 5.2
@@ -149,15 +144,7 @@ def _grass(noise: Noise, x: Floats, y: Floats, footprint: Floats, mown: float) -
     return mix(color, (0.25, 0.22, 0.10), 0.45 * dry)
 
 
-def _park(
-    noise: Noise,
-    plan: Plan,
-    x: Floats,
-    y: Floats,
-    i: Ints,
-    j: Ints,
-    footprint: Floats,
-) -> Floats:
+def _park(noise: Noise, plan: Plan, x: Floats, y: Floats, i: Ints, j: Ints, footprint: Floats) -> Floats:
     """Return mown lawn around a pond, with gravel paths: a ring and a cross."""
     a, b = plan.along_y.centres, plan.along_x.centres
     cx, cy = (a[i] + a[i + 1]) / 2, (b[j] + b[j + 1]) / 2
@@ -199,7 +186,7 @@ def _garden(noise: Noise, x: Floats, y: Floats, edge: Floats, footprint: Floats)
 
 
 def _square(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
-    """Return A paved square: bands of light stone every 5 m and slabs laid in two tones."""
+    """Return a paved square: bands of light stone every 5 m and slabs laid in two tones."""
     slab = cell_random(np.floor(x / 1.25), np.floor(y / 1.25), 23)
     tone = noise.layers(x, y, footprint, (7.0, 0.06), (1.0, 0.05), (0.3, 0.05))
     shade = (slab - 0.5) * 0.3 * resolved(1.25, footprint)
@@ -219,15 +206,7 @@ def _courtyard(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
     return mix(color, _grass(noise, x, y, footprint, 0.0), green)
 
 
-def _car_park(
-    noise: Noise,
-    plan: Plan,
-    x: Floats,
-    y: Floats,
-    i: Ints,
-    j: Ints,
-    footprint: Floats,
-) -> Floats:
+def _car_park(noise: Noise, plan: Plan, x: Floats, y: Floats, i: Ints, j: Ints, footprint: Floats) -> Floats:
     """Return asphalt with rows of stalls, aligned with the cars that `city.py` parks there."""
     a, b = plan.along_y, plan.along_x
     u = x - (a.centres[i] + a.halves[i] + SIDEWALK)

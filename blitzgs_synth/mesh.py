@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -62,7 +63,7 @@ class MeshBuilder:
     def walls(self, x0: float, y0: float, x1: float, y1: float, z0: float, z1: float, look: Look) -> None:
         """Add the four walls of a box."""
         corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
-        for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):
+        for (ax, ay), (bx, by) in pairwise([*corners, corners[0]]):
             self.quad((ax, ay, z0), (bx, by, z0), (bx, by, z1), (ax, ay, z1), look)
 
     def top(self, x0: float, y0: float, x1: float, y1: float, z: float, look: Look) -> None:
@@ -75,6 +76,12 @@ class MeshBuilder:
         """Add a box without its underside."""
         self.walls(x0, y0, x1, y1, z0, z1, side)
         self.top(x0, y0, x1, y1, z1, top)
+
+    def pyramid(self, x: float, y: float, half: float, z0: float, z1: float, look: Look) -> None:
+        """Add the four sides of a roof over a square, `half` to each side of its middle."""
+        corners = [(x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half)]
+        for (ax, ay), (bx, by) in pairwise([*corners, corners[0]]):
+            self.quad((ax, ay, z0), (bx, by, z0), (x, y, z1), (x, y, z1), look)
 
     def blob(self, centre: Point, radii: Point, look: Look) -> None:
         """Add a bumpy ellipsoid (the crown of a tree, a bush)."""

@@ -30,15 +30,8 @@ def each(task: Callable[[int], T], count: int, processes: int) -> Iterator[T]:
     """Yield task(0), task(1), ..., task(count - 1), in this order.
 
     The processes are forked, so that `task` may hold gigabytes, as a closure does; only indices and results
-    are sent. They end with this process, however it ends.
-
-    Args:
-        task: called in other processes, or in this one if there is only one.
-        count: number of calls.
-        processes: number of processes that share the calls.
-
-    Raises:
-        BrokenProcessPool: a process was killed, for example because memory ran out.
+    are sent. They end with this process, however it ends. With one process, the calls are in this one.
+    BrokenProcessPool: a process was killed, for example because memory ran out.
     """
     cv_threads = cv2.getNumThreads()
     # Every core runs a call of its own, and a forked process can neither use nor end OpenCV's threads.
@@ -82,14 +75,8 @@ def take_photographs(
     """Write the photographs of all views and return the corners found in each.
 
     A photograph that exists, is whole and has its corners beside it is not taken again. It is read once and
-    compared with the checksum that is kept with the corners.
-
-    Args:
-        folder: folder for `images/` and for `corners/`, from which an interrupted call continues.
-        city: the city to photograph.
-        views: the cameras.
-        processes: number of processes that share the views.
-        progress: called after each view.
+    compared with the checksum that is kept with the corners. So an interrupted call continues in its folder,
+    which gets `images/` and `corners/`. `progress` is called after each view.
     """
     for name in (IMAGES, CORNERS):
         (folder / name).mkdir(exist_ok=True)

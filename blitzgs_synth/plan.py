@@ -8,7 +8,7 @@ so that blocks stay rectangles for the builders while the streets the cameras se
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -46,68 +46,47 @@ FORMAT_VERSION = 3
 _LATER = ("built", "grain", "exposure", "altitudes")
 
 
+def _option(default: float, low: float, high: float, text: str) -> Any:
+    return field(default=default, metadata={"limits": (low, high), "help": text})
+
+
 @dataclass(frozen=True)
 class CityOptions:
-    """Parameters of a synthetic city; the same values give the same files.
+    """Parameters of a synthetic city, with their limits and texts; the same values give the same files.
 
-    Attributes:
-        extent: edge of the built-up square in metres, 60 to 20 000.
-        views: number of images, >= 3.
-        width: image width in pixels, >= 32.
-        height: image height in pixels, >= 32.
-        points_per_view: feature points looked for in each image; the cloud has somewhat fewer in total.
-        oblique: fraction of the views flown obliquely (45°, four headings); the others look straight down.
-        seed: of the layout, the buildings, the flight and the noise.
-        built: whether there is a city; false: flat farmland of finely textured crops.
-        grain: standard deviation of the noise of the photographs, in steps of 8-bit values.
-        exposure: standard deviation of the logarithm of the photographs' gains.
-        altitudes: number of heights flown at, 1 to 8; each is 1.6 times the one below it and has, for the
-            same overlap, 1 / 1.6² of its views.
+    The views that are not oblique look straight down; the oblique ones do so at 45°, in four headings. Each
+    altitude is 1.6 times the one below it and has, for the same overlap, 1 / 1.6² of its views.
     """
 
-    extent: float = 150.0
-    views: int = 60
-    width: int = 480
-    height: int = 320
-    points_per_view: int = 500
-    oblique: float = 0.6
-    seed: int = 0
-    built: bool = True
-    grain: float = 0.0
-    exposure: float = 0.0
-    altitudes: int = 1
+    extent: float = _option(150.0, 60.0, 20_000.0, "edge of the built-up square, metres")
+    views: int = _option(60, 3, 1_000_000, "number of images")
+    width: int = _option(480, 32, 16_384, "image width, pixels")
+    height: int = _option(320, 32, 16_384, "image height, pixels")
+    points_per_view: int = _option(500, 1, 100_000, "number of feature points to search for in each image")
+    oblique: float = _option(0.6, 0.0, 1.0, "fraction of oblique views, 0 to 1")
+    seed: int = _option(0, 0, 2**63 - 1, "seed of all random choices")
+    built: bool = _option(True, False, True, "a city; --no-built: flat farmland")
+    grain: float = _option(0.0, 0.0, 64.0, "noise of the photographs, in steps of 8-bit values")
+    exposure: float = _option(0.0, 0.0, 1.0, "standard deviation of the logarithm of the photographs' gains")
+    altitudes: int = _option(1, 1, 8, "number of heights flown at, 1 to 8")
 
     def __post_init__(self) -> None:
-        limits = {
-            "extent": (60.0, 20_000.0),
-            "views": (3, 1_000_000),
-            "width": (32, 16_384),
-            "height": (32, 16_384),
-            "points_per_view": (1, 100_000),
-            "oblique": (0.0, 1.0),
-            "seed": (0, 2**63 - 1),
-            "built": (False, True),
-            "grain": (0.0, 64.0),
-            "exposure": (0.0, 1.0),
-            "altitudes": (1, 8),
-        }
-        for name, (low, high) in limits.items():
-            value = getattr(self, name)
+        for each in fields(self):
+            (low, high), value = each.metadata["limits"], getattr(self, each.name)
             if not low <= value <= high:
-                raise ValueError(f"synthetic city: {name} must be between {low} and {high}, got {value}")
+                raise ValueError(f"synthetic city: {each.name} must be between {low} and {high}, got {value}")
 
     def manifest(self) -> dict[str, float | int]:
         """Return the parameters that decide the files' content, for a city's manifest.
 
         Those added later are left out where they change nothing, so that older cities need not be made anew.
         """
-        values = asdict(self)
-        same = [
-            field.name
-            for field in fields(self)
-            if field.name in _LATER and values[field.name] == field.default
-        ]
-        return {"format_version": FORMAT_VERSION, **{k: v for k, v in values.items() if k not in same}}
+        values = {
+            each.name: value
+            for each in fields(self)
+            if (value := getattr(self, each.name)) != each.default or each.name not in _LATER
+        }
+        return {"format_version": FORMAT_VERSION, **values}
 
 
 PRESETS = {

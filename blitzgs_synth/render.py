@@ -30,11 +30,7 @@ class RayCaster:
     """A triangle mesh that several threads may cast rays at."""
 
     def __init__(self, triangles: Floats) -> None:
-        """Build the acceleration structure of `triangles` [T, 3, 3] (metres).
-
-        Raises:
-            ModuleNotFoundError: `embreex` is not installed.
-        """
+        """Build the acceleration structure of `triangles` [T, 3, 3] (metres)."""
         try:
             from embreex.mesh_construction import TriangleMesh
             from embreex.rtcore_scene import EmbreeScene
@@ -166,14 +162,10 @@ class City:
         return first, number[leaders]
 
     def _color(self, view: View, surface: Ints, samples: Floats, group: Ints, count: Floats) -> Floats:
-        """Return the scene-linear RGB [3, G] of groups of samples.
+        """Return the scene-linear RGB [3, G] of groups of samples at positions [S, 3].
 
-        Args:
-            view: the camera.
-            surface: of each of G groups, sorted by material.
-            samples: positions [S, 3] of the samples.
-            group: of each sample [S].
-            count: samples of each group [G].
+        `surface`: of each of G groups, sorted by material. `group`: of each sample [S]. `count`: samples of
+        each group [G].
         """
         sums = np.stack([np.bincount(group, channel) for channel in samples.T])
         position = (sums / count).astype(np.float32)

@@ -84,14 +84,9 @@ Mapper = Callable[[Callable[[int], Ints], int], Iterable[Ints]]
 
 
 def track(city: City, views: list[View], corners: list[Corners], seed: int, run: Mapper) -> Cloud:
-    """Return the cloud of all corners seen in three views or more.
+    """Return the cloud of all corners, of each view, that are seen in three views or more.
 
-    Args:
-        city: casts the rays that find hidden corners.
-        views: V cameras.
-        corners: the corners found in each view.
-        seed: of the noise.
-        run: applies a function to all view indices and yields the results in order; may run concurrently.
+    `run` applies a function to all view indices and yields the results in order; it may run concurrently.
     """
     positions = np.concatenate([c.positions for c in corners])
     directions = np.concatenate([c.directions for c in corners])

@@ -22,15 +22,16 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from blitzgs import quat_scale_to_covar_preci, rasterization, relocate
 from blitzgs.capture.cameras import camera_centres
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.images import ImageStore
+from blitzgs.formats.gaussians import SH_C0
 from blitzgs.frame.render import RenderOptions
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.photometric import photometric_loss
-from blitzgs.population.initialisation import SH_C0
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.views import Space, ViewSet
 
@@ -75,11 +76,7 @@ class GsplatOptions:
 
     @classmethod
     def of(cls, strategy: str, changes: dict[str, Any]) -> GsplatOptions:
-        """Return the defaults for a strategy with some changes.
-
-        Raises:
-            ValueError: an unknown option, or a value of another type.
-        """
+        """Return the defaults for a strategy with some changes (ValueError: a name or type is wrong)."""
         values: dict[str, Any] = {"reset": strategy == "default-reset"}
         if strategy == "mcmc":
             values |= {"init_opa": 0.5, "init_scale": 0.1, "opacity_reg": 0.01, "scale_reg": 0.01}
@@ -102,11 +99,7 @@ class GsplatOptions:
 
 
 def load_strategies() -> Any:
-    """Import gsplat's strategies; MCMCStrategy calls two functions of gsplat's CUDA extension, here ours.
-
-    Raises:
-        ImportError: gsplat is not installed.
-    """
+    """Import gsplat's strategies; MCMCStrategy calls two functions of gsplat's CUDA extension, here ours."""
     try:
         import gsplat.strategy as strategies
         from gsplat.strategy import ops
@@ -164,13 +157,10 @@ def space_of(capture: Capture) -> Space:
 class GsplatTrainer:
     """A training with one of gsplat's strategies, batch size 1.
 
-    Attributes:
-        options: options of the trainer.
-        total: number of steps of the whole training.
-        step: number of steps taken.
-        params: the Gaussians before activation: means, scales, quats, opacities, sh0, shN.
-        peak: largest number of Gaussians so far.
+    `params` has the Gaussians before activation: means, scales, quats, opacities, sh0, shN.
     """
+
+    rasterization: Any = staticmethod(rasterization)
 
     def __init__(
         self,
@@ -183,13 +173,7 @@ class GsplatTrainer:
     ) -> None:
         """Initialise from the capture's points and put its training photographs on the device.
 
-        Args:
-            strategy: one of `STRATEGIES`.
-            options: see `GsplatOptions.of`.
-            capture: cameras, points and split.
-            images: its photographs.
-            device: device to train on.
-            seed: seed of the order of views and of every random draw.
+        `strategy`: one of `STRATEGIES`. `seed`: of the order of views and of every random draw.
         """
         self.options, self.device = options, device
         self.space = space_of(capture)
@@ -199,11 +183,8 @@ class GsplatTrainer:
         self.params, self._optimisers = self.initialise(capture)
         self.peak = len(self.params["means"])
         self._strategy.check_sanity(self.params, self._optimisers)
-        self._state = (
-            self._strategy.initialize_state()
-            if self._is_mcmc
-            else self._strategy.initialize_state(scene_scale=self.space.extent)
-        )
+        scale = {} if self._is_mcmc else {"scene_scale": self.space.extent}
+        self._state = self._strategy.initialize_state(**scale)
         self._decay = torch.optim.lr_scheduler.ExponentialLR(
             self._optimisers["means"], gamma=0.01 ** (1.0 / self.total)
         )
@@ -260,23 +241,33 @@ class GsplatTrainer:
             self.step += 1
             self.peak = max(self.peak, len(self.params["means"]))
 
-    def _take_step(self) -> None:
-        options, params = self.options, self.params
-        views, target, mask = self._batches[next(self._order)]
-        renders, _, info = rasterization(
-            params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid(),
-            torch.cat([params["sh0"], params["shN"]], dim=1), views.viewmats, views.Ks, views.width,
+    def render(self, views: Any) -> tuple[Tensor, Any]:
+        """Return the image of a view and what the strategy needs of it."""
+        options, p = self.options, self.params
+        image, _, info = self.rasterization(
+            p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(),
+            torch.cat([p["sh0"], p["shN"]], dim=1), views.viewmats, views.Ks, views.width,
             views.height, near_plane=options.near_plane, far_plane=options.far_plane,
             sh_degree=self.sh_degree, packed=options.packed, absgrad=options.absgrad,
             rasterize_mode="antialiased" if options.antialiased else "classic",
         )  # fmt: skip
-        self._strategy.step_pre_backward(params, self._optimisers, self._state, self.step, info)
+        return image, info
+
+    def loss(self, renders: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+        """Return the loss of an image against its photograph."""
+        options, params = self.options, self.params
         loss = photometric_loss(renders, target, mask, options.ssim_lambda)[0]
         if options.opacity_reg > 0:
             loss = loss + options.opacity_reg * params["opacities"].sigmoid().mean()
         if options.scale_reg > 0:
             loss = loss + options.scale_reg * params["scales"].exp().mean()
-        loss.backward()
+        return loss
+
+    def _take_step(self) -> None:
+        views, target, mask = self._batches[next(self._order)]
+        image, info = self.render(views)
+        self._strategy.step_pre_backward(self.params, self._optimisers, self._state, self.step, info)
+        self.loss(image, target, mask).backward()
         for optimiser in self._optimisers.values():
             optimiser.step()
             optimiser.zero_grad(set_to_none=True)

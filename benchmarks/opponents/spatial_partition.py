@@ -51,8 +51,7 @@ class Grid:
     def __init__(self, capture: Capture, columns: int, rows: int) -> None:
         """Divide the box around most points on the plane of the cameras' flight.
 
-        Raises:
-            ValueError: the training cameras, or the points, are on one line.
+        ValueError: the training cameras, or the points, are on one line.
         """
         self.shape = np.array([columns, rows])
         centres = camera_centres(np.stack([capture.cameras[i].world_to_camera for i in capture.train]))
@@ -81,23 +80,16 @@ class Grid:
         place = np.array([cell % self.shape[0], cell // self.shape[0]])
         low = np.where(place == 0, -np.inf, place - halo)
         high = np.where(place == self.shape - 1, np.inf, place + 1 + halo)
-        within: npt.NDArray[np.bool_] = ((coordinates >= low) & (coordinates < high)).all(axis=1)
-        return within
+        return ((coordinates >= low) & (coordinates < high)).all(axis=1)
 
 
 @dataclass(frozen=True)
 class Block:
-    """The cameras and points on which one cell is trained.
-
-    Attributes:
-        cell: number of the cell.
-        cameras: indices of cameras in the capture.
-        points: bool [M], the points of the capture from which the training starts.
-    """
+    """The cameras and points on which one cell is trained."""
 
     cell: int
-    cameras: list[int]
-    points: npt.NDArray[np.bool_]
+    cameras: list[int]  # indices in the capture
+    points: npt.NDArray[np.bool_]  # bool [M], the points of the capture from which the training starts
 
 
 def divide(capture: Capture, grid: Grid) -> list[Block]:
@@ -133,18 +125,12 @@ def coverage(capture: Capture, blocks: list[Block]) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Merged:
-    """A model that was merged from blocks.
+    """A model that was merged from blocks."""
 
-    Attributes:
-        table: the Gaussians, in the unit of the whole scene.
-        sh_degree: SH degree with which the model is rendered.
-        blocks: a record for each cell: "cameras", "points", "seconds" of training, "images" trained on,
-            "gaussians" trained and "kept" of them, "peak"; those that could not be trained have zeros.
-        merge_seconds: time for merging the models.
-    """
-
-    table: GaussianTable
-    sh_degree: int
+    table: GaussianTable  # in the unit of the whole scene
+    sh_degree: int  # with which the model is rendered
+    # Of each cell "cameras", "points", "seconds" of training, "images" trained on, "gaussians" trained and
+    # "kept" of them, "peak"; those that could not be trained have zeros.
     blocks: list[dict[str, Any]]
     merge_seconds: float
 
@@ -161,19 +147,9 @@ class _BlockTrainer(Trainer):
 def train(
     config: Config, capture: Capture, images: ImageStore, ranks: Ranks, grid: Grid, blocks: list[Block]
 ) -> Merged:
-    """Train every block that has cameras and points, and merge the models.
+    """Train every block (of `divide`) that has cameras and points on one rank, and merge the models.
 
-    Args:
-        config: configuration of each block's training.
-        capture: the whole scene.
-        images: its photographs.
-        ranks: the job, of one rank.
-        grid: the grid of the blocks.
-        blocks: from `divide`.
-
-    Raises:
-        ValueError: no block could be trained.
-        InterruptedError: stopped by a signal.
+    ValueError: no block could be trained. InterruptedError: stopped by a signal.
     """
     records, parts, degree = [], [], 0
     merge_seconds = 0.0
@@ -233,7 +209,4 @@ def _in_picture(points: Float64, camera: Any) -> npt.NDArray[np.bool_]:
     seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     pixels = seen @ camera.K.T
     x, y, depth = pixels[:, 0], pixels[:, 1], seen[:, 2]
-    inside: npt.NDArray[np.bool_] = (
-        (depth > 0) & (x >= 0) & (y >= 0) & (x < camera.width * depth) & (y < camera.height * depth)
-    )
-    return inside
+    return (depth > 0) & (x >= 0) & (y >= 0) & (x < camera.width * depth) & (y < camera.height * depth)

@@ -88,14 +88,10 @@ class LazyAdam(torch.optim.Optimizer):
             lr: learning rate; a scheduler may change it from step to step.
             betas: decay rates of the moments, 0 <= beta1 < sqrt(beta2) < 1.
             eps: added to the root of the second moment.
-            foreach: accepted and not needed: it selects how `torch.optim.Adam` computes, never the result.
-            fused: accepted and not needed, as `foreach`: a step is always a fused kernel.
-            weight_decay: only 0 is supported, as `torch.optim.Adam` has it by default.
-            amsgrad: only False.
-            maximize: only False.
-            capturable: only False.
-            differentiable: only False.
-            decoupled_weight_decay: accepted, without effect if there is no weight decay.
+            foreach, fused: accepted and not needed: they select how `torch.optim.Adam` computes, never the
+                result. A step is always a fused kernel.
+            decoupled_weight_decay: accepted, without effect as there is no weight decay.
+            weight_decay, amsgrad, maximize, capturable, differentiable: only the default.
 
         Raises:
             ValueError: an option is outside its range, or not supported.

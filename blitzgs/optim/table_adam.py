@@ -89,17 +89,11 @@ class TableAdam:
     ) -> None:
         """Take step number `step` (from 1) for the Gaussians that a frame shows.
 
-        Args:
-            table: the table that was rendered, unchanged since.
-            frame: of `render_frame`.
-            gradients: gradients of the frame's splats, from `frame.backward_splats`.
-            scale_reg: weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no
-                such term.
-            opacity_reg: weight per view, [B], of the opacity of each Gaussian visible in it; None: no such
-                term.
-            step: number of the step; the visible rows must be current up to `step` - 1.
-            means2d_sums: [P, 2], receives the gradient of the splats' means2d if its parts are at several
-                ranks.
+        `table`: the one that was rendered, unchanged since; its visible rows must be current up to
+        `step` - 1. `gradients`: of the frame's splats, from `frame.backward_splats`. `scale_reg`,
+        `opacity_reg`: weights per view, [B], of the smallest axis and of the opacity of each Gaussian visible
+        in it; None: no such term. `means2d_sums`: [P, 2], receives the gradient of the splats' means2d if its
+        parts are at several ranks.
         """
         project_bwd_step_(
             _state_of(table),

@@ -12,6 +12,7 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import smallest
 from blitzgs.ops.counter_random import hash_keys, normal
+from blitzgs.ops.rows import take_rows
 from blitzgs.optim.table_adam import Pending
 from blitzgs.spawn.candidates import Candidates, Veto, spawn_features
 from blitzgs.spawn.lineage import Births, Cause, Lineage
@@ -111,16 +112,24 @@ def densify(
         candidates = _within_cap(candidates, gradient, table["id"], rules.max_gaussians, ranks)
     clones = (candidates & small).nonzero().squeeze(1)
     splits = (candidates & ~small).nonzero().squeeze(1)
-    new = _children(table, clones, splits, time, seed, level_count)
-    new["last_step"] = torch.full_like(new["birth"], step)
-    causes = death_causes(table, rules, None, pending)
+    parts = (clones, *[splits] * CHILDREN_OF_A_SPLIT)
+    parents, slots = torch.cat(parts), torch.cat([torch.full_like(p, slot) for slot, p in enumerate(parts)])
+    new = new_rows(table, parents, slots, time, step)
+    level = new["level"]
+    new["level"] = torch.where(slots > 0, (level.int() + 1).clamp(max=level_count - 1), level).to(level.dtype)
+    _shrink({name: column[len(clones) :] for name, column in new.items()}, seed, time)
+    causes = death_causes(table, rules, current(table, "opacities", pending), pending)
     causes[splits] = Cause.SPLIT
     gone = causes.nonzero().squeeze(1)
     causes = torch.cat((causes, causes_of(new["level"], new["scales"], None, new["opacities"], rules)))
     born = (causes[len(table) :] == 0).nonzero().squeeze(1)
     if lineage is not None:
-        died = len(causes) - (len(table) - len(gone)) - len(born)
-        _log(lineage, table, new, (clones, splits), causes, died, time, step, extent, level_count)
+        features = spawn_features(table, parents, slots > 0, time, extent, level_count)
+        lineage.born(Births(new["id"], new["parent"], new["means"], features), step)
+        # With a size that it knows, the host does not wait for the device.
+        n_died = len(causes) - (len(table) - len(gone)) - len(born)
+        died = torch.nonzero_static(causes, size=n_died).squeeze(1)
+        lineage.died(torch.cat((table["id"], new["id"]))[died], causes[died], time, step)
     grown = len(clones) + len(splits)
     report = DensityReport(
         cloned=len(clones),
@@ -129,7 +138,6 @@ def densify(
         held_back=int(wanted) - grown - vetoed,
         vetoed=vetoed,
     )
-    parents = torch.cat((clones, *[splits] * CHILDREN_OF_A_SPLIT))
     if len(born) < len(parents):
         parents, new = parents[born], {name: column[born] for name, column in new.items()}
     table.replace(place(len(table), gone, parents, new["means"]), new, most_rows(rules, ranks))
@@ -174,25 +182,20 @@ def _within_cap(candidates: Tensor, gradient: Tensor, ids: Tensor, cap: int, ran
     return kept
 
 
-def _children(
-    table: GaussianTable, clones: Tensor, splits: Tensor, time: int, seed: int, level_count: int
-) -> dict[str, Tensor]:
-    """Return new rows: copies of the rows `clones`, then each child of `splits`; without `last_step`."""
-    rows = torch.cat((clones, *[splits] * CHILDREN_OF_A_SPLIT))
-    slots = torch.zeros_like(rows)
-    for slot in range(1, CHILDREN_OF_A_SPLIT + 1):
-        begin = len(clones) + (slot - 1) * len(splits)
-        slots[begin : begin + len(splits)] = slot
-    parents, level = table["id"][rows], table["level"][rows]
-    children = {name: table[name].index_select(0, rows) for name in PARAMETERS} | {
-        "id": child_ids(parents, time, slots),
-        "parent": parents,
-        "birth": torch.full_like(table["birth"][rows], time),
-        "level": torch.where(slots > 0, (level.int() + 1).clamp(max=level_count - 1), level).to(level.dtype),
-    }
-    children |= table.inherited(rows)
-    _shrink({name: column[len(clones) :] for name, column in children.items()}, seed, time)
-    return children
+def new_rows(table: GaussianTable, rows: Tensor, slots: Tensor, time: int, step: int) -> dict[str, Tensor]:
+    """Return copies of the rows `rows` as new Gaussians, born in the slots of `child_ids`."""
+    names, parents = (*PARAMETERS, "level"), table["id"][rows]
+    new = dict(zip(names, take_rows([table[name] for name in names], rows), strict=True))
+    return (
+        new
+        | table.inherited(rows)
+        | {
+            "id": child_ids(parents, time, slots),
+            "parent": parents,
+            "birth": torch.full_like(rows, time, dtype=torch.int32),
+            "last_step": torch.full_like(rows, step, dtype=torch.int32),
+        }
+    )
 
 
 def _shrink(children: dict[str, Tensor], seed: int, time: int) -> None:
@@ -213,19 +216,16 @@ def rotations(quats: Tensor) -> Tensor:
     return quaternion_matrices(quats / quats.norm(dim=1, keepdim=True).clamp(min=1e-30))
 
 
-def death_causes(
-    table: GaussianTable, rules: DensityRules, opacities: Tensor | None = None, pending: Pending | None = None
-) -> Tensor:
-    """Return why each row of a table is pruned, see `causes_of`.
+def current(table: GaussianTable, name: str, pending: Pending | None) -> Tensor:
+    """Return a column as it is after the table's pending steps; None: there are none."""
+    return table[name] if pending is None else pending.current(name)
 
-    `table`: the rows, with the largest radii since the last event. `opacities`: the logits after all steps,
-    if they are known. `pending`: the table's pending steps; None: there are none.
-    """
-    if opacities is None:
-        opacities = table["opacities"] if pending is None else pending.current("opacities")
-    scales = table["scales"]
-    if rules.max_scale is not None and pending is not None:
-        scales = pending.current("scales")
+
+def death_causes(
+    table: GaussianTable, rules: DensityRules, opacities: Tensor, pending: Pending | None
+) -> Tensor:
+    """Return why each row of a table is pruned, see `causes_of`; `opacities` are those after all steps."""
+    scales = table["scales"] if rules.max_scale is None else current(table, "scales", pending)
     return causes_of(table["level"], scales, table["max_radii"], opacities, rules)
 
 
@@ -245,28 +245,3 @@ def causes_of(
 def most_rows(rules: DensityRules, ranks: Ranks) -> int | None:
     """Return the most rows that a rank's share of the population needs; None: there is no limit."""
     return None if rules.max_gaussians is None else -(-rules.max_gaussians // ranks.world_size)
-
-
-def _log(
-    lineage: Lineage,
-    table: GaussianTable,
-    new: dict[str, Tensor],
-    parents: tuple[Tensor, Tensor],
-    causes: Tensor,
-    died: int,
-    time: int,
-    step: int,
-    extent: float,
-    level_count: int,
-) -> None:
-    """Log an event, before its rows are removed and its statistics are reset.
-
-    `died` is the number of `causes` that are not 0, so that the host need not wait for it.
-    """
-    gone = torch.nonzero_static(causes, size=died).squeeze(1)
-    clones, splits = parents
-    rows = torch.cat((clones, *[splits] * CHILDREN_OF_A_SPLIT))
-    is_split = torch.arange(len(rows), device=rows.device) >= len(clones)
-    features = spawn_features(table, rows, is_split, time, extent, level_count)
-    lineage.born(Births(new["id"], new["parent"], new["means"], features), step)
-    lineage.died(torch.cat((table["id"], new["id"]))[gone], causes[gone], time, step)

@@ -21,9 +21,7 @@ class GrowthLimit:
     """The largest population that a density event may make."""
 
     count: int  # Gaussians, over all ranks
-    # The limit that applies, for the log: "memory", or the configuration field "population.max_gaussians",
-    # "population.pixels_per_gaussian" or "population.gaussians_per_point".
-    reason: str
+    reason: str  # the limit that applies, for the log: "memory", or a configuration field
 
 
 def growth_limit(
@@ -35,17 +33,14 @@ def growth_limit(
     which has more points where there is more detail; 0: they limit nothing. `memory_count`: from
     `memory_limit`; None: no such limit.
     """
-    limits = []
-    if config.max_gaussians > 0:
-        limits.append(GrowthLimit(config.max_gaussians, "population.max_gaussians"))
-    if config.pixels_per_gaussian > 0:
-        count = max(1, int(pixels / config.pixels_per_gaussian))
-        limits.append(GrowthLimit(count, "population.pixels_per_gaussian"))
-    if config.gaussians_per_point > 0 and points > 0:
-        count = max(1, int(points * config.gaussians_per_point))
-        limits.append(GrowthLimit(count, "population.gaussians_per_point"))
-    if memory_count is not None:
-        limits.append(GrowthLimit(memory_count, "memory"))
+    per_pixel, per_point = config.pixels_per_gaussian, config.gaussians_per_point
+    counts = {
+        "population.max_gaussians": config.max_gaussians or None,
+        "population.pixels_per_gaussian": max(1, int(pixels / per_pixel)) if per_pixel > 0 else None,
+        "population.gaussians_per_point": max(1, int(points * per_point)) if points * per_point > 0 else None,
+        "memory": memory_count,
+    }
+    limits = [GrowthLimit(count, reason) for reason, count in counts.items() if count is not None]
     return min(limits, key=lambda limit: limit.count, default=None)
 
 
@@ -60,10 +55,7 @@ def memory_limit(table: GaussianTable, ranks: Ranks) -> int | None:
         return None
     sizes = table.row_bytes.values()
     if table.device.type == "cpu":
-        free = available_bytes()
-        if free is None:
-            return None
-        available, scratch = free // ranks.local_world_size + table.memory_bytes, 0
+        available, scratch = available_bytes() // ranks.local_world_size + table.memory_bytes, 0
     else:
         # One query; `torch.cuda.memory_allocated` and the like each collect and flatten all statistics.
         statistics = torch.cuda.memory_stats_as_nested_dict(ranks.device)
@@ -79,14 +71,10 @@ def memory_limit(table: GaussianTable, ranks: Ranks) -> int | None:
 
 
 def rows_that_fit(rows: int, row_bytes: int, widest_column: int, available: int, scratch: int) -> int:
-    """Return how many rows of a table fit into memory.
+    """Return how many rows of a table, which has `rows` now, fit into `available` bytes.
 
-    Args:
-        rows: present number of rows of the table.
-        row_bytes: bytes of one row in all columns.
-        widest_column: bytes of one row in the widest column, which is copied when the table grows.
-        available: bytes for the table and everything else.
-        scratch: largest number of bytes needed so far beyond the present table.
+    `row_bytes`: of one row in all columns; `widest_column`: in the widest one, which is copied when the table
+    grows. `scratch`: largest number of bytes needed so far beyond the present table.
     """
     each = row_bytes + widest_column + scratch / max(rows, 1)
     return int(MEMORY_SHARE * available / each)

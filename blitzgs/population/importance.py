@@ -94,20 +94,12 @@ def sweep(
 ) -> Importance:
     """Score the Gaussians by their contributions to V views. Collective: every rank calls it.
 
-    Args:
-        gaussians: this rank's Gaussians, without pending optimiser steps.
-        batches: the views, each once, in the same batches on every rank.
-        n_views: V, columns of the cull matrix.
-        options: how the views are rendered.
-        owners: divides the tiles by their costs; the result does not depend on it.
-        rule: rule of the score.
-        lod: leaves Gaussians out of views as rendering does; there they contribute nothing and hide nothing.
-            None: no gate.
-        stops: whether to give up, asked before each batch but the first; the same answer on every rank. None:
-            never.
-
-    Raises:
-        SweepStoppedError: `stops` said so; the table is as it was.
+    `gaussians`: this rank's, without pending optimiser steps. `batches`: the views, each once, in the same
+    batches on every rank. `n_views`: V, columns of the cull matrix. `owners`: divides the tiles by their
+    costs; the result does not depend on it. `rule`: of the score. `lod`: leaves Gaussians out of views as
+    rendering does; there they contribute nothing and hide nothing. `stops`: whether to give up, asked before
+    each batch but the first; the same answer on every rank. SweepStoppedError: `stops` said so; the table is
+    as it was.
     """
     table = table_of(gaussians)
     sums = _Sums(len(table), n_views, table.device, rule)

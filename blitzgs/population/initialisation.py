@@ -9,17 +9,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from blitzgs.formats.gaussians import SH_C0
 from blitzgs.ops.counter_random import uniform
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.population import CELL_BITS, voxel_keys
 from blitzgs.table.table import GaussianTable, opacity_logit
 from blitzgs.view.levels import BLOCK_POINTS, PAIRS_OF_POINTS, Levels, PointBlocks
 
-SH_C0 = 0.28209479177387814
 # Smallest size of a first Gaussian, relative to the coarsest voxel: two voxel centres may coincide.
 SMALLEST_SPACING = 1e-4
-
-
 # Opacity of the initial Gaussians.
 INITIAL_OPACITY = 0.1
 

@@ -20,20 +20,20 @@ from blitzgs.ops.population import (
     residual_draws,
     share_rows_,
 )
-from blitzgs.ops.rows import take_rows
 from blitzgs.optim.table_adam import Pending
 from blitzgs.population.density import (
     CHILDREN_OF_A_SPLIT,
     DensityReport,
     DensityRules,
-    child_ids,
+    current,
     death_causes,
     most_rows,
+    new_rows,
 )
 from blitzgs.spawn.candidates import spawn_features
 from blitzgs.spawn.lineage import Births, Cause, Lineage
 from blitzgs.table.placement import place
-from blitzgs.table.table import PARAMETERS, GaussianTable, opacity_logit
+from blitzgs.table.table import GaussianTable, opacity_logit
 
 
 @torch.no_grad()
@@ -78,7 +78,7 @@ def relocate(
         The report; `cloned` is the number of all copies on this rank, `relocated` that of the dead they
         replace.
     """
-    opacities = table["opacities"] if pending is None else pending.current("opacities")
+    opacities = current(table, "opacities", pending)
     causes = death_causes(table, rules, opacities, pending)
     dead, weights = causes != 0, draw_weights(opacities, causes)
     own = torch.stack((torch.full((), len(table), device=dead.device), dead.sum(), weights.sum()))
@@ -109,7 +109,10 @@ def relocate(
         copies + 1,
         opacity_logit(rules.min_opacity),
     )
-    new = _copies(table, parents, copies, time, step)
+    # Slots after those of clones and splits, which may have the same parents in the same event.
+    first = (copies.cumsum(0) - copies).repeat_interleave(copies, output_size=len(parents))
+    slots = torch.arange(len(parents), device=parents.device) - first + (CHILDREN_OF_A_SPLIT + 1)
+    new = new_rows(table, parents, slots, time, step)
     if lineage is not None and features is not None:
         lineage.born(Births(new["id"], new["parent"], new["means"], features), step)
         lineage.died(table["id"][gone], torch.full_like(gone, Cause.RELOCATED), time, step)
@@ -149,17 +152,10 @@ def draw_in_proportion(
     Chen 1998). This has the least variance, and exactly `count` draws in all, except that no row is drawn
     `MAX_COPIES` times.
 
-    Args:
-        weights: int64 [N_rank], 0 to 2^31, fewer than 2^31 over all ranks.
-        total: sum of the weights of all ranks.
-        count: below 2^31.
-        ids: int64 [N_rank], persistent.
-        time: time of the event, in images.
-        ranks: the job; every rank calls this.
-
-    Returns:
-        int64 [N_rank], how often each row was drawn, the same for the same ids at every world size. Zeros if
-        all weights are 0.
+    `weights`: int64 [N_rank], 0 to 2^31, fewer than 2^31 over all ranks; `total`: their sum over all ranks.
+    `count`: below 2^31. `ids`: int64 [N_rank], persistent. `time`: of the event, in images. Every rank calls
+    this. Returns int64 [N_rank], how often each row was drawn, the same for the same ids at every world size;
+    zeros if all weights are 0.
     """
     if total == 0 or count <= 0:
         return torch.zeros_like(weights)
@@ -167,25 +163,6 @@ def draw_in_proportion(
     whole, keys = residual_draws(weights, ids, count, total, seed, -1 - time)
     rest = count - int(ranks.all_reduce(whole.sum()))
     return whole.add_(smallest(keys, ids, rest, ranks)).clamp_(max=MAX_COPIES - 1)
-
-
-def _copies(table: GaussianTable, rows: Tensor, counts: Tensor, time: int, step: int) -> dict[str, Tensor]:
-    """Return new rows that copy each of `rows` as often as `counts` has it."""
-    first = counts.cumsum(0) - counts
-    # Use slots after those of clones and splits, which may have the same parents in the same event.
-    slots = torch.arange(len(rows), device=rows.device)
-    slots -= first.repeat_interleave(counts, output_size=len(rows))
-    slots += CHILDREN_OF_A_SPLIT + 1
-    names = (*PARAMETERS, "level")
-    new = dict(zip(names, take_rows([table[name] for name in names], rows), strict=True))
-    new |= table.inherited(rows)
-    parents = table["id"][rows]
-    return new | {
-        "id": child_ids(parents, time, slots),
-        "parent": parents,
-        "birth": torch.full_like(table["birth"][rows], time),
-        "last_step": torch.full_like(table["birth"][rows], step),
-    }
 
 
 @dataclass(frozen=True)

@@ -159,7 +159,7 @@ def save(folder: Path, model: TrainedModel, ranks: Ranks, in_background: bool = 
 
 
 def _memory_left(device: torch.device) -> int:
-    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else available_bytes() or 0
+    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else available_bytes()
 
 
 def restore(

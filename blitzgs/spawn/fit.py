@@ -39,6 +39,7 @@ ROUNDS = 150
 # Smallest share of the rows for a leaf. Leaves with fewer rows fit peculiarities of a scene, which lowers the
 # AUC on other scenes.
 LEAF_SHARE = 1 / 500
+AXES = ("x", "y", "z")  # columns with the positions
 # With a single scene: share of its births, by parent, that are held out to evaluate the fit on the others.
 HELD_OUT = 0.25
 
@@ -87,17 +88,27 @@ def read_spawns(folder: Path, gaussians: int | None = None) -> Spawns:
     alive = ~np.isin(births["id"], deaths["id"])
     if not np.isin(deaths["id"], births["id"]).all() or gaussians not in (None, int(alive.sum())):
         raise ValueError(f"{folder} is not complete: a file of its births or deaths is lost")
-    survived = alive[spawned]
-    check_outcomes(survived, folder)
+    columns = {name: column[spawned] for name, column in births.items()} | {"survived": alive[spawned]}
+    return spawns_of(about | {"initial_survival": float(alive[~spawned].mean())}, columns, folder)
+
+
+def spawns_of(about: dict[str, Any], columns: Mapping[str, NDArray[Any]], source: Path) -> Spawns:
+    """Return spawns from the description of their run and their columns by name.
+
+    Features without a column are NaN. ValueError: all or none survived; names `source`.
+    """
+    survived = columns["survived"].astype(bool)
+    check_outcomes(survived, source)
+    unknown = np.full(len(survived), np.nan, np.float32)
     return Spawns(
         name=about["name"],
         scene=about["scene"],
         schedule=about["schedule"],
-        features=feature_columns({name: births[name][spawned] for name in births}, len(survived)),
+        features=np.stack([columns.get(name, unknown).astype(np.float32) for name in FEATURES], 1),
         survived=survived,
-        parents=births["parent"][spawned],
-        positions=np.stack([births[axis][spawned] for axis in "xyz"], 1),
-        initial_survival=float(alive[~spawned].mean()),
+        parents=columns["parent"],
+        positions=np.stack([columns[axis] for axis in AXES], 1),
+        initial_survival=about.get("initial_survival", math.nan),
     )
 
 
@@ -136,12 +147,6 @@ def with_distinct_names(runs: Sequence[Spawns]) -> list[Spawns]:
     return found
 
 
-def feature_columns(columns: Mapping[str, NDArray[Any]], count: int) -> NDArray[np.float32]:
-    """Return the features of K spawns, float32 [K, F], from columns by name; NaN where there is none."""
-    unknown = np.full(count, np.nan, np.float32)
-    return np.stack([columns.get(name, unknown).astype(np.float32) for name in FEATURES], 1)
-
-
 def auc(scores: NDArray[Any], positive: NDArray[np.bool_]) -> float:
     """Return the area under the ROC curve, from the sum of ranks (Mann and Whitney 1947).
 
@@ -175,24 +180,22 @@ def fit(runs: Sequence[Spawns], path: Path, gate_from: float = 0.0) -> dict[str,
     check_no_other(path)
     runs = with_distinct_names(runs)
     _check_same_schedule(runs)
-    scenes = sorted({run.scene for run in runs})
+    several = len({run.scene for run in runs}) > 1
     figures = []
     for run in runs:
-        if len(scenes) > 1:
-            others = [other for other in runs if other.scene != run.scene]
-            judged = np.ones(len(run.survived), bool)
-            booster = _train(xgboost, others, [np.ones(len(o.survived), bool) for o in others])
+        if several:
+            held_out, others = run, [other for other in runs if other.scene != run.scene]
         else:
-            judged = _hash_uniform(run.parents) < HELD_OUT
-            for part in (judged, ~judged):
-                check_outcomes(run.survived[part], f"{run.name}, of which a part is held out")
-            booster = _train(xgboost, runs, [_hash_uniform(o.parents) >= HELD_OUT for o in runs])
-        held_out = run.only(judged)
+            held_out = run.only(_hash_uniform(run.parents) < HELD_OUT)
+            others = [other.only(_hash_uniform(other.parents) >= HELD_OUT) for other in runs]
+            for part in (held_out, *others):
+                check_outcomes(part.survived, f"{part.name}, of which a part is held out")
         data = xgboost.DMatrix(held_out.features, feature_names=list(FEATURES))
-        figures.append(judge(held_out, booster.predict(data, output_margin=True), gate_from))
-    protocol = "leave one scene out" if len(scenes) > 1 else "a quarter of the parents held out"
+        scores = _train(xgboost, others).predict(data, output_margin=True)
+        figures.append(judge(held_out, scores, gate_from))
+    protocol = "leave one scene out" if several else "a quarter of the parents held out"
     result = {"protocol": protocol, "held_out": figures}
-    booster = _train(xgboost, runs, [np.ones(len(run.survived), bool) for run in runs])
+    booster = _train(xgboost, runs)
     write_file(path, bytes(booster.save_raw("json")))
     write_info(path, GateInfo(FEATURES, runs[0].schedule, {run.name: run.scene for run in runs}, auc=result))
     return result
@@ -234,15 +237,15 @@ def _check_same_schedule(runs: Sequence[Spawns]) -> None:
             )
 
 
-def _train(xgboost: ModuleType, runs: Sequence[Spawns], rows: Sequence[NDArray[np.bool_]]) -> Any:
+def _train(xgboost: ModuleType, runs: Sequence[Spawns]) -> Any:
     generator = np.random.default_rng(0)
     features, labels = [], []
-    for run, mine in zip(runs, rows, strict=True):
-        chosen = mine.nonzero()[0]
-        if len(chosen) > MAX_ROWS:
-            chosen = np.sort(generator.choice(chosen, MAX_ROWS, replace=False))
-        features.append(run.features[chosen])
-        labels.append(run.survived[chosen])
+    for run in runs:
+        rows: Any = slice(None)
+        if len(run.survived) > MAX_ROWS:
+            rows = np.sort(generator.choice(len(run.survived), MAX_ROWS, replace=False))
+        features.append(run.features[rows])
+        labels.append(run.survived[rows])
     data = xgboost.DMatrix(np.concatenate(features), np.concatenate(labels), feature_names=list(FEATURES))
     # A row's weight in a leaf is p (1 - p), at most 1/4.
     least = {"min_child_weight": LEAF_SHARE * data.num_row() / 4}

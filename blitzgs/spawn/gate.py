@@ -81,18 +81,18 @@ def check_no_other(path: Path) -> None:
     metadata = info_path(path)
     for file in (path, metadata):
         check_replaceable(file)
-    foreign = None
+    foreign = metadata
     try:
         content = json.loads(metadata.read_text())
-        if not (isinstance(content, dict) and {"format", "features"} <= content.keys()):
-            foreign = metadata
+        if isinstance(content, dict) and {"format", "features"} <= content.keys():
+            return
     except FileNotFoundError:
-        if path.exists():
-            foreign = path
+        if not path.exists():
+            return
+        foreign = path
     except (ValueError, RecursionError):
-        foreign = metadata
-    if foreign is not None:
-        raise FileExistsError(f"{foreign} exists and does not belong to a gate: choose another --out")
+        pass
+    raise FileExistsError(f"{foreign} exists and does not belong to a gate: choose another --out")
 
 
 def read_info(path: Path) -> GateInfo:
@@ -137,7 +137,7 @@ class SpawnGate:
                 f"'{path.stem}.json') converts it"
             )
         try:
-            self._trees = _Trees.of(json.loads(path.read_text()))
+            self._trees = _trees_of(json.loads(path.read_text()))
         except OSError as error:
             raise GateError(f"{path} cannot be read: {error.strerror or error}") from error
         except (ValueError, LookupError, TypeError, OverflowError, RuntimeError) as error:
@@ -148,9 +148,8 @@ class SpawnGate:
 
         Returns int64 [M], the sum of the trees' leaves in units of 2^-32: log odds up to a constant.
         """
-        self._trees = self._trees.to(features.device)
-        trees = self._trees
-        return tree_sums(features, trees.roots, trees.nodes, trees.leaves, trees.depth)
+        device, (roots, nodes, leaves, depth) = features.device, self._trees
+        return tree_sums(features, roots.to(device), nodes.to(device), leaves.to(device), depth)
 
 
 # The following three are vetoes once the arguments before `candidates` are given (`functools.partial`). Each
@@ -200,58 +199,42 @@ def veto_lowest(scores: Tensor, candidates: Candidates, rate: float, ranks: Rank
     return vetoed
 
 
-@dataclass(frozen=True)
-class _Trees:
-    """All nodes of all trees, one after the other, as `tree_sums` takes them."""
-
-    roots: Tensor  # int32 [T]
-    nodes: Tensor  # int32 [n, 4]
-    leaves: Tensor  # int64 [n], in units of 2^-32
-    depth: int  # of the deepest tree
-
-    @classmethod
-    def of(cls, model: dict[str, Any]) -> _Trees:
-        """Read the trees of a model."""
-        learner = model["learner"]
-        objective, count = learner["objective"]["name"], int(learner["learner_model_param"]["num_feature"])
-        if objective != "binary:logistic" or count != len(FEATURES):
-            raise ValueError(f"objective {objective} with {count} features")
-        roots: list[int] = []
-        thresholds: list[float] = []
-        splits: list[tuple[int, int, int]] = []
-        leaves: list[int] = []
-        depth = 0
-        for tree in learner["gradient_booster"]["model"]["trees"]:
-            first = len(leaves)
-            roots.append(first)
-            depth = max(depth, _depth(tree["left_children"], tree["right_children"]))
-            for node, left in enumerate(tree["left_children"]):
-                value = tree["split_conditions"][node]
-                if left < 0:
-                    splits.append((0, -1, -1))
-                else:
-                    feature, unknown = tree["split_indices"][node], bool(tree["default_left"][node])
-                    if not (isinstance(feature, int) and 0 <= feature < count):
-                        raise ValueError(f"a split of feature {feature}")
-                    if node in tree.get("categories_nodes", ()) or math.isnan(value):
-                        raise ValueError(f"a split of feature {feature} without a threshold")
-                    splits.append((2 * feature + unknown, first + left, first + tree["right_children"][node]))
-                thresholds.append(0.0 if left < 0 else value)
-                leaves.append(round(value * 2**_LEAF_BITS) if left < 0 else 0)
-        if not roots:
-            raise ValueError("no trees")
-        # The sum of the leaves that a row reaches is an integer of 64 bits.
-        if sum(max(map(abs, leaves[first:end])) for first, end in pairwise([*roots, len(leaves)])) >= 2**63:
-            raise ValueError("the leaves of its trees may add up to 2^31 or more")
-        bits = torch.tensor(thresholds, dtype=torch.float32).view(torch.int32)
-        nodes = torch.cat((bits[:, None], torch.tensor(splits, dtype=torch.int32).view(-1, 3)), 1)
-        return cls(torch.tensor(roots, dtype=torch.int32), nodes, torch.tensor(leaves), depth)
-
-    def to(self, device: torch.device) -> _Trees:
-        """Return the trees on a device."""
-        if self.roots.device == device:
-            return self
-        return _Trees(self.roots.to(device), self.nodes.to(device), self.leaves.to(device), self.depth)
+def _trees_of(model: dict[str, Any]) -> tuple[Tensor, Tensor, Tensor, int]:
+    """Return roots, nodes, leaves and depth of all trees of a model, as `tree_sums` takes them."""
+    learner = model["learner"]
+    objective, count = learner["objective"]["name"], int(learner["learner_model_param"]["num_feature"])
+    if objective != "binary:logistic" or count != len(FEATURES):
+        raise ValueError(f"objective {objective} with {count} features")
+    roots: list[int] = []
+    thresholds: list[float] = []
+    splits: list[tuple[int, int, int]] = []
+    leaves: list[int] = []
+    depth = 0
+    for tree in learner["gradient_booster"]["model"]["trees"]:
+        first = len(leaves)
+        roots.append(first)
+        depth = max(depth, _depth(tree["left_children"], tree["right_children"]))
+        for node, left in enumerate(tree["left_children"]):
+            value = tree["split_conditions"][node]
+            if left < 0:
+                splits.append((0, -1, -1))
+            else:
+                feature, unknown = tree["split_indices"][node], bool(tree["default_left"][node])
+                if not (isinstance(feature, int) and 0 <= feature < count):
+                    raise ValueError(f"a split of feature {feature}")
+                if node in tree.get("categories_nodes", ()) or math.isnan(value):
+                    raise ValueError(f"a split of feature {feature} without a threshold")
+                splits.append((2 * feature + unknown, first + left, first + tree["right_children"][node]))
+            thresholds.append(0.0 if left < 0 else value)
+            leaves.append(round(value * 2**_LEAF_BITS) if left < 0 else 0)
+    if not roots:
+        raise ValueError("no trees")
+    # The sum of the leaves that a row reaches is an integer of 64 bits.
+    if sum(max(map(abs, leaves[first:end])) for first, end in pairwise([*roots, len(leaves)])) >= 2**63:
+        raise ValueError("the leaves of its trees may add up to 2^31 or more")
+    bits = torch.tensor(thresholds, dtype=torch.float32).view(torch.int32)
+    nodes = torch.cat((bits[:, None], torch.tensor(splits, dtype=torch.int32).view(-1, 3)), 1)
+    return torch.tensor(roots, dtype=torch.int32), nodes, torch.tensor(leaves), depth
 
 
 def _depth(left: list[int], right: list[int]) -> int:

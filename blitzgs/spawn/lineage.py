@@ -100,7 +100,7 @@ class Lineage:
             self.describe(about or {})
         ranks.barrier()
         # Changes since the ledger.
-        self._births = self._deaths = 0
+        self._counts = dict.fromkeys(TABLES, 0)
         self._id_sum = torch.zeros((), dtype=torch.int64, device=ranks.device)
         self._pending: dict[str, list[tuple[Tensor, ...]]] = {table: [] for table in TABLES}
         # The events that a stop kept from happening write parts of the checkpoint's step, beside those of the
@@ -137,10 +137,10 @@ class Lineage:
             raise error
         self._parts = max(parts for _, parts in found)
         device = self._id_sum.device
-        counts = torch.tensor([self._births, self._deaths, len(ids)], device=device)
+        counts = torch.tensor([*self._counts.values(), len(ids)], device=device)
         hashes = torch.stack((self._id_sum, hash_keys(ids).sum().to(device)))
         births, deaths, live, change, id_sum = self._ranks.all_reduce(torch.cat((counts, hashes))).tolist()
-        self._births = self._deaths = 0
+        self._counts = dict.fromkeys(TABLES, 0)
         self._id_sum.zero_()
         ledger = Ledger(
             self.ledger.births + births,
@@ -169,7 +169,10 @@ class Lineage:
                 continue
             groups = [torch.cat(parts, 1) for parts in zip(*blocks, strict=True)]
             blocks.clear()
-            self._count(groups[0][0], births=table == "births")
+            # Not at each event: hashes take many small kernels.
+            ids, sign = groups[0][0], 1 if table == "births" else -1
+            self._counts[table] += len(ids)
+            self._id_sum += sign * hash_keys(ids).sum()
             name = f"{table}_{step:08d}_{self._ranks.rank:04d}_{self._parts:04d}.parquet"
             self._parts += 1
             self._writer.add(name, table, groups)
@@ -180,16 +183,6 @@ class Lineage:
         self._rows += groups[0].shape[1]
         if self._rows > _MAX_PENDING:
             self.flush(step)
-
-    def _count(self, ids: Tensor, births: bool) -> None:
-        """Add the births or deaths of a part to the sums. Not at each event: it takes many small kernels."""
-        hashes = hash_keys(ids).sum()
-        if births:
-            self._births += len(ids)
-            self._id_sum += hashes
-        else:
-            self._deaths += len(ids)
-            self._id_sum -= hashes
 
 
 def initial_births(ids: Tensor, parents: Tensor, means: Tensor) -> Births:

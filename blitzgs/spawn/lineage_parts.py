@@ -157,9 +157,7 @@ def read_lineage(folder: Path) -> dict[str, dict[str, Any]]:
                 raise ValueError(f"{folder}: the files of its {table} have different columns") from error
             tables[table] = {name: joined[name].to_numpy() for name in joined.column_names}
         else:
-            tables[table] = {
-                name: torch.empty(0, dtype=torch.int64).numpy() for name in ("id", "time", "cause")
-            }
+            tables[table] = {name: np.empty(0, np.int64) for name in ("id", "time", "cause")}
     return tables
 
 

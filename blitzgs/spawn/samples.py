@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import torch
 
 from blitzgs.ops.counter_random import uniform
 from blitzgs.spawn.candidates import FEATURES
-from blitzgs.spawn.fit import Spawns, check_outcomes, feature_columns, read_about
+from blitzgs.spawn.fit import AXES, Spawns, read_about, spawns_of
 from blitzgs.spawn.lineage_parts import check_columns, import_pyarrow, read_numbers
 from blitzgs.util.output import check_replaceable, new_file
 
@@ -23,7 +22,6 @@ MAX_ROWS = 250_000
 _ABOUT = b"blitzgs.spawns"
 # Seed of the draw of parents; no other draw uses it.
 _SEED = 0x5A3B1E
-_AXES = ("x", "y", "z")
 
 
 def write_sample(run: Spawns, path: Path, most: int = MAX_ROWS) -> float:
@@ -37,7 +35,7 @@ def write_sample(run: Spawns, path: Path, most: int = MAX_ROWS) -> float:
     rate = min(1.0, most / len(run.survived))
     some = run.only((uniform(_SEED, torch.from_numpy(run.parents)) < rate).numpy())
     columns: dict[str, Any] = {"parent": some.parents, "survived": some.survived}
-    columns |= dict(zip(_AXES, some.positions.T, strict=True))
+    columns |= dict(zip(AXES, some.positions.T, strict=True))
     columns |= dict(zip(FEATURES, some.features.T, strict=True))
     about = {
         "name": run.name,
@@ -78,18 +76,6 @@ def read_sample(path: Path) -> Spawns:
     content = (table.schema.metadata or {}).get(_ABOUT)
     if content is None:
         raise ValueError(f"{path} is not a sample of spawns: write one with blitzgs gate sample")
-    check_columns(table, ("parent", "survived", *_AXES), path)
+    check_columns(table, ("parent", "survived", *AXES), path)
     columns = {name: table[name].to_numpy() for name in table.column_names}
-    about = read_about(content, path)
-    survived = columns["survived"].astype(bool)
-    check_outcomes(survived, path)
-    return Spawns(
-        name=about["name"],
-        scene=about["scene"],
-        schedule=about["schedule"],
-        features=feature_columns(columns, len(table)),
-        survived=survived,
-        parents=columns["parent"],
-        positions=np.stack([columns[axis] for axis in _AXES], 1),
-        initial_survival=about.get("initial_survival", math.nan),
-    )
+    return spawns_of(read_about(content, path), columns, path)

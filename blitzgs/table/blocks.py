@@ -173,22 +173,15 @@ class Cameras(NamedTuple):
 
 
 class BlockVisibility:
-    """Tests which blocks the views of several batches may see; copies the result to the host asynchronously.
-
-    Attributes:
-        batches: number of batches.
-    """
+    """Tests which blocks the views of several batches may see; the host gets the result meanwhile."""
 
     def __init__(
         self, bounds: Tensor, cameras: Cameras, batch_size: int, culled: Tensor | None = None
     ) -> None:
         """Queue the test.
 
-        Args:
-            bounds: bounds of N blocks, float32 [N, 8].
-            cameras: views of consecutive batches, at most 32.
-            batch_size: views per batch.
-            culled: result of `culled_blocks` for the same blocks; None: there is no cull mask.
+        `bounds`: of N blocks, float32 [N, 8]. `cameras`: views of consecutive batches, at most 32.
+        `batch_size`: views per batch. `culled`: `culled_blocks` of the same blocks; None: there is no mask.
         """
         self._batch_size = batch_size
         self.batches = len(cameras.viewmats) // batch_size

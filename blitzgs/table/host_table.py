@@ -7,16 +7,14 @@ import contextlib
 import math
 import mmap
 import weakref
-from pathlib import Path
 
+import psutil
 import torch
 from torch import Tensor
 
 from blitzgs.ops.rows import take_rows
 from blitzgs.table.table import GROWTH, GaussianTable
 from blitzgs.util.terminal import amount
-
-MEMORY_INFO = Path("/proc/meminfo")
 
 
 class HostMemoryError(RuntimeError):
@@ -54,7 +52,7 @@ class HostTable(GaussianTable):
         rows = max(1, rows)
         size = rows * like.element_size() * math.prod(like.shape[1:])
         available = available_bytes()
-        if available is not None and size > available:
+        if size > available:
             raise HostMemoryError(
                 f"a column of {len(like):,} Gaussians needs {amount(size)} in the memory of the host, which "
                 f"has {amount(available)} left: use more memory or hosts, or cap population.max_gaussians"
@@ -90,13 +88,9 @@ def fits(memory: Tensor | None, like: Tensor, rows: int) -> bool:
     )
 
 
-def available_bytes() -> int | None:
-    """Return how many bytes the host can allocate without swapping; None if the system does not tell."""
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        for line in MEMORY_INFO.read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) * 1024
-    return None
+def available_bytes() -> int:
+    """Return how many bytes the host can allocate without swapping."""
+    return int(psutil.virtual_memory().available)
 
 
 def _unpin(address: int, _pages: mmap.mmap) -> None:

@@ -23,11 +23,8 @@ def place(count: int, gone: Tensor, beside: Tensor, means: Tensor) -> Placement:
     behind those of the same block; a bracket and the one that closes it get the same row. So in each block as
     many new rows as possible replace others, and other pairs are close.
 
-    Args:
-        count: N.
-        gone: int64 [D], ascending, the rows that leave.
-        beside: int64 [M], rows near which the new Gaussians lie, such as their parents'; they may be leaving.
-        means: float32 [M, 3], positions of the new Gaussians.
+    `count`: N. `gone`: int64 [D], ascending, the rows that leave. `beside`: int64 [M], rows near which the
+    new Gaussians lie, such as their parents'; they may be leaving. `means`: float32 [M, 3], their positions.
     """
     leaving, joining = len(gone), len(beside)
     blocks, by_block = torch.sort(beside // BLOCK_ROWS, stable=True)

@@ -83,11 +83,8 @@ class Pool:
     ) -> None:
         """Allocate the pool (PoolError: the budget is less than two blocks).
 
-        Args:
-            table: the table on the host; pinned if `device` is a GPU.
-            device: device of the pool.
-            budget_bytes: bytes of the device that the pool may take.
-            pending_table: as for `BlockIndex`, on the device.
+        `table`: on the host, pinned if `device` is a GPU. `budget_bytes`: of the device that the pool may
+        take. `pending_table`: as for `BlockIndex`, on the device.
         """
         self.table, self._device, self._budget = table, device, budget_bytes
         self.moved = Moved()
@@ -144,10 +141,7 @@ class Pool:
             # Free the old pool before allocating the new one.
             self.held.columns.clear()
             self._storage.clear()
-            self._storage = {
-                name: torch.zeros((allocated_rows, *row.shape), dtype=row.dtype, device=self._device)
-                for name, row in ((name, table.row_of(name)) for name in names)
-            }
+            self._storage = {n: table.row_of(n).zeros(allocated_rows, self._device) for n in names}
         self.held = self._held_of({name: self._storage[name] for name in names}, rows)
         self._block_in = np.full(slots, _FREE, dtype=np.int64)
         self._slot_of = np.full(self._blocks, _FREE, dtype=np.int64)
@@ -291,8 +285,15 @@ class Pool:
         missing = (wanted & (self._slot_of < 0)).nonzero()[0]
         free = self._first_to_go(wanted if kept is None else wanted | kept, len(missing))
         if required and len(missing) > len(free):
-            self._refuse(int(wanted.sum()))
-        self._fetch(free, missing[: len(free)], after)
+            needed, slots = int(wanted.sum()), len(self._block_in)
+            raise PoolError(
+                f"views that are rendered together see {needed:,} blocks of 256 Gaussians, "
+                f"{amount(needed * self._bytes_in)}, and the pool has room for {slots:,}, "
+                f"{amount(slots * self._bytes_in)}: raise {_SETTING}, or train with a lower "
+                "schedule.batch_size"
+            )
+        self._move(free, missing[: len(free)], after)
+        self._count(loaded=min(len(missing), len(free)))
         return len(missing) <= len(free)
 
     def _load_ahead(self, loading: int) -> None:
@@ -313,23 +314,8 @@ class Pool:
             return
         slots = self._first_to_go(due < UNSEEN, min(rate - loading, len(missing)))
         coming = missing[np.argsort(due[missing], kind="stable")[: len(slots)]]
-        self._fetch(slots, coming, self._begun)
-
-    def _fetch(
-        self, slots: npt.NDArray[np.int64], blocks: npt.NDArray[np.int64], after: torch.cuda.Event | None
-    ) -> None:
-        """Start to load blocks that views see into slots."""
-        self._move(slots, blocks, after)
-        self._count(loaded=len(blocks))
-
-    def _refuse(self, needed: int) -> None:
-        slots = len(self._block_in)
-        raise PoolError(
-            f"views that are rendered together see {needed:,} blocks of 256 Gaussians, "
-            f"{amount(needed * self._bytes_in)}, and the pool has room for {slots:,}, "
-            f"{amount(slots * self._bytes_in)}: raise {_SETTING}, or train with a lower "
-            "schedule.batch_size"
-        )
+        self._move(slots, coming, self._begun)
+        self._count(loaded=len(coming))
 
     def _first_to_go(self, held: npt.NDArray[np.bool_], count: int) -> npt.NDArray[np.int64]:
         """Choose up to `count` slots to load into: empty ones, then those whose blocks are needed last.

@@ -51,6 +51,10 @@ class Column:
         """Bytes of one row."""
         return self.dtype.itemsize * math.prod(self.shape)
 
+    def zeros(self, count: int, device: torch.device) -> Tensor:
+        """Return zeros for so many rows, [count, ...]."""
+        return torch.zeros((count, *self.shape), dtype=self.dtype, device=device)
+
 
 class Placement(NamedTuple):
     """Which row of a table each new Gaussian gets, and which others move."""
@@ -113,9 +117,9 @@ def stored_rows(name: str, count: int) -> int:
 class GaussianTable:
     """One rank's Gaussians as named columns of equal length N.
 
-    The operations `append`, `keep`, `permute`, `replace` and `move_rows` act on all columns, one column at a
-    time, so that peak memory exceeds the table by one column and not by a second table. `replace` touches
-    only the rows that change; for that, columns that grow have memory for more rows than they hold.
+    The operations `keep`, `permute`, `replace` and `move_rows` act on all columns, one column at a time, so
+    that peak memory exceeds the table by one column and not by a second table. `replace` touches only the
+    rows that change; for that, columns that grow have memory for more rows than they hold.
 
     The column `CULL` is converted whenever it is set, read or moved.
     """
@@ -148,24 +152,27 @@ class GaussianTable:
 
     @classmethod
     def create(cls, rows: Mapping[str, Tensor]) -> GaussianTable:
-        """Build a table from new rows; see `append` for what they may hold.
+        """Build a table from copies of rows: `PARAMETERS`, and other columns of `schema`.
 
-        Of the columns of `REQUIRED`, only the parameters must be given. The others default to those of first
-        Gaussians: at step 0, with the ids 0 .. N - 1, without parents, born at time 0, at level 0.
+        Columns that are absent are those of first Gaussians: at step 0, with the ids 0 .. N - 1, without
+        parents, born at time 0, at level 0, and zeros. ValueError: as the constructor; a parameter is
+        missing, or a column is unknown.
         """
-        columns = schema(round(rows["sh"].shape[1] ** 0.5) - 1)
+        expected = schema(round(rows["sh"].shape[1] ** 0.5) - 1)
+        if missing := [name for name in PARAMETERS if name not in rows]:
+            raise ValueError(f"GaussianTable: new rows lack the columns {missing}")
+        if unknown := [name for name in rows if name not in expected]:
+            raise ValueError(f"GaussianTable: the table has no columns {unknown}")
         count, device = len(rows["means"]), rows["means"].device
-        table = cls({n: torch.empty((0, *c.shape), dtype=c.dtype, device=device) for n, c in columns.items()})
-        zeros = torch.zeros(count, dtype=torch.int32, device=device)
-        first = {
-            "last_step": zeros,
-            "id": torch.arange(count, device=device),
-            "parent": torch.full((count,), NO_PARENT, device=device),
-            "birth": zeros,
-            "level": zeros.to(torch.uint8),
+        columns = {
+            name: rows[name].clone() if name in rows else column.zeros(count, device)
+            for name, column in expected.items()
         }
-        table.append(first | dict(rows))
-        return table
+        if "id" not in rows:
+            columns["id"] = torch.arange(count, device=device)
+        if "parent" not in rows:
+            columns["parent"].fill_(NO_PARENT)
+        return cls(columns)
 
     @classmethod
     def of_parameters(cls, columns: Mapping[str, Tensor]) -> GaussianTable:
@@ -283,20 +290,8 @@ class GaussianTable:
         """Adam's second moments in the order of `PARAMETERS`."""
         return _EXP_AVG_SQS_OF(self.columns)
 
-    def append(self, rows: Mapping[str, Tensor]) -> None:
-        """Add rows at the end.
-
-        `rows`: name -> tensor [M, ...] of every column; those of `ZERO_AT_BIRTH` may be absent. ValueError: a
-        column is missing, an unknown one is given, or shapes or dtypes differ.
-        """
-        count = self._check_new(rows)
-        for name in self._to_change():
-            column = self[name]
-            new = rows[name] if name in rows else column.new_zeros((count, *column.shape[1:]))
-            self._store(name, torch.cat((column, new)))
-
-    def _check_new(self, rows: Mapping[str, Tensor]) -> int:
-        """Check rows that are to be added; return how many."""
+    def _check_new(self, rows: Mapping[str, Tensor]) -> None:
+        """Check rows that are to be added."""
         if missing := [name for name in self if name not in rows and name not in ZERO_AT_BIRTH]:
             raise ValueError(f"GaussianTable: new rows lack the columns {missing}")
         if unknown := [name for name in rows if name not in self]:
@@ -310,7 +305,6 @@ class GaussianTable:
                     f"GaussianTable: column '{name}' of new rows must be {column.dtype} {list(wanted)}, "
                     f"got {new.dtype} {list(new.shape)}"
                 )
-        return count
 
     def inherited(self, parents: Tensor) -> dict[str, Tensor]:
         """Return the columns that new rows inherit from their parents, the rows `parents` (int64 [M])."""
@@ -323,7 +317,9 @@ class GaussianTable:
             raise ValueError(
                 f"GaussianTable.keep: mask must be bool [{len(self)}], got {mask.dtype} {list(mask.shape)}"
             )
-        self._select(mask.nonzero().squeeze(1))
+        rows = mask.nonzero().squeeze(1)
+        for name in self._to_change():
+            self._store(name, *take_rows([self[name]], rows))
 
     def permute(self, order: Tensor) -> None:
         """Reorder the rows: row i becomes the old row `order[i]` (int64 [N], a permutation)."""
@@ -349,8 +345,9 @@ class GaussianTable:
     def replace(self, placement: Placement, new: Mapping[str, Tensor], most: int | None = None) -> None:
         """Let rows leave and new ones join; all other rows stay where they are, except those that move.
 
-        `placement`: of `blitzgs.table.placement.place`. `new`: as for `append`. `most`: about the most rows
-        that the table will ever have; None: unknown.
+        `placement`: of `blitzgs.table.placement.place`. `new`: name -> tensor [M, ...] of every column; those
+        of `ZERO_AT_BIRTH` may be absent. `most`: about the most rows that the table will ever have; None:
+        unknown. ValueError: a column is missing, an unknown one is given, or shapes or dtypes differ.
         """
         self._check_new(new)
         columns = {name: self._lengthen(name, placement.total, most) for name in self._to_change()}
@@ -379,7 +376,3 @@ class GaussianTable:
             (moved,) = take_rows([self[name]], order)
             del self[name]
             self._store(name, ranks.all_to_all(moved, sent, received))
-
-    def _select(self, rows: Tensor) -> None:
-        for name in self._to_change():
-            self._store(name, *take_rows([self[name]], rows))

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from blitzgs.formats.gaussians import SH_C0
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.render import Frame, RenderOptions, render_frame
 from blitzgs.frame.tiles import TileAssignment, collect_images
@@ -30,8 +31,6 @@ from blitzgs.view.visible import Subject, TableOrPool, VisibleFinder, VisibleRow
 
 T = TypeVar("T")
 
-# The constant of the first spherical harmonic: colour = 0.5 + _SH_0 * coefficient.
-_SH_0 = 0.28209479177387814
 # Bytes of a frame for each Gaussian that a view may see (the splat, its copy on another rank, list entries
 # and their sorting), and for each pixel.
 _ROW_BYTES, _PIXEL_BYTES = 300, 64
@@ -74,7 +73,7 @@ class Drawer:
         """
         begin, subject, ranks = time.perf_counter(), self._subject, self._owners.ranks
         device = ranks.device
-        pose, K = (torch.from_numpy(matrix).float()[None].to(device) for matrix in (look.viewmat, look.K))  # noqa: N806
+        pose, K = (torch.from_numpy(matrix).float()[None].to(device) for matrix in (look.viewmat, look.K))
         views = Views(pose, K, look.width, look.height)
         options = self._options(look)
         ranges = assignment = None
@@ -213,7 +212,7 @@ def _painted(table: GaussianTable) -> GaussianTable:
     """Return a table of the same Gaussians, coloured by their octree levels."""
     colours = torch.tensor(LEVEL_COLOURS, device=table.device)
     levels = table["level"].int() % len(colours)
-    sh = ((colours - 0.5) / _SH_0)[levels][:, None]
+    sh = ((colours - 0.5) / SH_C0)[levels][:, None]
     columns = {name: table[name] for name in (*PARAMETERS[:4], "level", "id")}
     return GaussianTable.of_parameters(columns | {"sh": sh})
 

@@ -141,7 +141,7 @@ class ModelGate:
         means, rules = table["means"], self.rules(table["level"], viewmats)
         if rules is None:
             return None
-        active = _all_rows(len(means), len(viewmats), means.device)
+        active = all_rows(len(means), len(viewmats), means.device)
         gate_views_(active, means, viewmats, rules)
         return active
 
@@ -171,7 +171,7 @@ def centres_of(viewmats: Tensor) -> Tensor:
     return -(poses[:, :3, :3].mT @ poses[:, :3, 3:]).squeeze(2)
 
 
-def _all_rows(count: int, views: int, device: torch.device) -> ActiveRows:
+def all_rows(count: int, views: int, device: torch.device) -> ActiveRows:
     """Return the active set in which every view may see every row."""
     bits = (1 << views) - 1
     return ActiveRows(

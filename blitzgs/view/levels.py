@@ -74,12 +74,9 @@ def footprint_levels(sizes: Tensor, reach: float, reference_distance: float, for
     The level is the finest whose `farthest` distance is at least that at which the footprint becomes too
     small. So a view that leaves out levels by distance leaves out only Gaussians of smaller footprints.
 
-    Args:
-        sizes: `footprint_sizes`, [N].
-        reach: distance at which the footprint of a size of 1 becomes too small: the focal length in pixels
-            over the smallest footprint.
-        reference_distance: d_0 of the levels.
-        fork: ratio of neighbouring levels, of which there are `FOOTPRINT_LEVELS`.
+    `sizes`: `footprint_sizes`, [N]. `reach`: distance at which the footprint of a size of 1 becomes too
+    small: the focal length in pixels over the smallest footprint. `reference_distance`: d_0 of the levels.
+    `fork`: ratio of neighbouring levels, of which there are `FOOTPRINT_LEVELS`.
     """
     level = ((math.log(reference_distance / reach) - sizes) / math.log(fork) + 0.5).floor()
     return level.clamp(0, FOOTPRINT_LEVELS - 1).to(torch.uint8)
@@ -95,14 +92,9 @@ def measure_levels(
     largest extent between the 1 % and 99 % coordinate quantiles, at most 50 times that between the quartiles;
     level 0 has voxels of box / f^b with b = round(log_2(1 / base_resolution)) - floor(K / 2) + 1.
 
-    Args:
-        points: float64 [M, 3], M >= 1, on any device.
-        centres: camera centres, float64 [V, 3], V >= 1, on the same device.
-        fork: f > 1.
-        base_resolution: finest sensible voxel relative to the box.
-
-    Raises:
-        ValueError: the cloud or the set of cameras is empty, or all points coincide.
+    `points`: float64 [M, 3], on any device. `centres`: of the cameras, float64 [V, 3], on the same device.
+    `fork`: f > 1. `base_resolution`: finest sensible voxel relative to the box. ValueError: the cloud or the
+    set of cameras is empty, or all points coincide.
     """
     if len(points) == 0 or len(centres) == 0:
         raise ValueError(
@@ -197,10 +189,6 @@ class PointBlocks:
     def __len__(self) -> int:
         return len(self.low)
 
-    def rows(self, values: Tensor) -> Tensor:
-        """Return the value [B] of each block for each of its points, [M] in the order of `order`."""
-        return values.repeat_interleave(BLOCK_POINTS)[: len(self.order)]
-
     def distances_of(self, centres: Tensor, chosen: Tensor, filling: float) -> Tensor:
         """Return the distances of cameras to all points of some blocks.
 
@@ -219,13 +207,9 @@ class PointBlocks:
     ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Bound the distances of cameras to the points of each block, for some cameras at a time.
 
-        Args:
-            centres: float64 [V, 3], on the device of the points.
-            which: int64 [B], the blocks; None: all.
-
-        Yields:
-            The next v centres, and two bounds, float64 [v, B]: no point of the block is nearer than the first
-            or farther than the second.
+        `centres`: float64 [V, 3], on the device of the points. `which`: int64 [B], the blocks; None: all.
+        Yields the next v centres, and two bounds, float64 [v, B]: no point of the block is nearer than the
+        first or farther than the second.
         """
         low, high = (self.low, self.high) if which is None else (self.low[which], self.high[which])
         for some in centres.split(max(1, _PAIRS // max(1, len(low)))):

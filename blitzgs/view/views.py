@@ -89,7 +89,7 @@ VIEW_NUMBERS = 16 + 9
 
 def unpack_views(numbers: Tensor, width: int, height: int) -> Views:
     """Return views that `ViewSet.write` wrote; they share the memory of `numbers`, float32 [B * 25]."""
-    viewmats, Ks = numbers.split_with_sizes(  # noqa: N806
+    viewmats, Ks = numbers.split_with_sizes(
         [16 * (len(numbers) // VIEW_NUMBERS), 9 * (len(numbers) // VIEW_NUMBERS)]
     )
     return Views(viewmats.view(-1, 4, 4), Ks.view(-1, 3, 3), width, height)
@@ -122,7 +122,7 @@ class ViewSet:
         count = 16 * len(indices)
         # `take` needs half the time of an index: this thread holds Python's lock meanwhile.
         numbers[:count] = self._viewmats.take(indices, axis=0).ravel()
-        Ks = self._Ks.take(indices, axis=0)  # noqa: N806
+        Ks = self._Ks.take(indices, axis=0)
         if factor > 1:
             Ks[:, :2] /= factor
         numbers[count:] = Ks.ravel()
@@ -130,7 +130,7 @@ class ViewSet:
     def columns(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return viewmats [V, 4, 4], Ks [V, 3, 3] and sizes (int32 [V, 2]) of all cameras, on the device."""
         columns = self._viewmats, self._Ks, np.array(self._sizes, dtype=np.int32)
-        viewmats, Ks, sizes = (torch.from_numpy(column).to(self._device) for column in columns)  # noqa: N806
+        viewmats, Ks, sizes = (torch.from_numpy(column).to(self._device) for column in columns)
         return viewmats, Ks, sizes
 
     def centres(self, indices: list[int]) -> Tensor:

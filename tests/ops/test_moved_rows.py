@@ -24,6 +24,7 @@ from blitzgs.table.placement import place
 from blitzgs.table.table import CULL, sectors_in
 from tests.helpers import DEVICES, refused
 from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views
+from tests.table.test_table import append
 from tests.training.tiny import random_gaussians
 
 COLUMNS = [
@@ -138,7 +139,7 @@ def test_a_table_s_mask_moves_with_its_rows(n, device):
     table.keep(torch.rand(n, generator=generator).to(device) < 0.7)
     left = len(table)
     check(left)
-    table.append({name: table[name][:70] for name in table})
+    append(table, {name: table[name][:70] for name in table})
     check(left + 70)
     assert table[CULL][left:].any()
     gone = torch.arange(0, left + 70, 5, device=device)
@@ -154,12 +155,12 @@ def test_new_rows_need_a_mask_and_may_inherit_it():
     table[CULL] = random_rows(100, 1)
     more = random_gaussians(5)
     with pytest.raises(ValueError, match=r"new rows lack the columns \['cull'\]"):
-        table.append({name: more[name] for name in more})
+        append(table, {name: more[name] for name in more})
     parents = torch.tensor([7, 7, 0, 99, 3])
-    table.append({name: more[name] for name in more} | table.inherited(parents))
+    append(table, {name: more[name] for name in more} | table.inherited(parents))
     assert torch.equal(table[CULL][100:], table[CULL][parents])
     with pytest.raises(ValueError, match=r"column 'cull' of new rows must be torch.int32 \[5, 1\]"):
-        table.append({name: more[name] for name in more} | {CULL: random_rows(5, 2)})
+        append(table, {name: more[name] for name in more} | {CULL: random_rows(5, 2)})
     del table[CULL]
     assert CULL not in table
 

@@ -242,8 +242,6 @@ def test_a_table_on_the_host_is_limited_by_the_memory_of_the_host(monkeypatch):
     table.replace(place(999, nothing, nothing.new_zeros(1), new["means"]), new)
     available = 1_000_000_000 + 1250 * sum(sizes)
     assert memory_limit(table, ranks) == rows_that_fit(1000, sum(sizes), max(sizes), available, 0)
-    monkeypatch.setattr(growth, "available_bytes", lambda: None)
-    assert memory_limit(table, ranks) is None
 
 
 def test_statistics_are_gathered_until_there_are_enough():

@@ -8,7 +8,7 @@ from blitzgs.ops.blocks import BLOCK_ROWS
 from blitzgs.table.blocks import BlockIndex, morton_order, spread
 from blitzgs.table.host_table import HostTable
 from blitzgs.table.placement import place
-from blitzgs.table.table import NO_PARENT, PARAMETERS, REQUIRED, ZERO_AT_BIRTH, GaussianTable, schema
+from blitzgs.table.table import PARAMETERS, REQUIRED, ZERO_AT_BIRTH, GaussianTable, Placement, schema
 from tests.helpers import DEVICES, refused
 
 
@@ -21,6 +21,13 @@ def filled_table(count: int, seed: int = 0) -> GaussianTable:
         value = ids.reshape(-1, *([1] * len(column.shape))).expand(count, *column.shape) % 251
         columns[name] = ids if name == "id" else value.to(column.dtype).contiguous()
     return GaussianTable(columns)
+
+
+def append(table: GaussianTable, rows) -> None:
+    """Add rows at the end, in their order."""
+    count, nothing = len(table), torch.empty(0, dtype=torch.int64, device=table.device)
+    new = torch.arange(count, count + len(rows["means"]), device=table.device)
+    table.replace(Placement(count + len(new), new, nothing, nothing), rows)
 
 
 def assert_rows_whole(table: GaussianTable) -> None:
@@ -45,7 +52,7 @@ def test_permute_keep_and_append_move_whole_rows():
     assert_rows_whole(table)
     more = filled_table(7, seed=2)
     before = len(table)
-    table.append({**more.columns, "extra": (more["id"] % 251).double()})
+    append(table, {**more.columns, "extra": (more["id"] % 251).double()})
     assert len(table) == before + 7
     assert_rows_whole(table)
 
@@ -109,7 +116,7 @@ def test_new_rows_start_with_zero_moments_and_statistics():
 def test_a_table_of_parameters_alone_holds_first_gaussians():
     source = filled_table(5)
     table = GaussianTable.create({name: source[name] for name in PARAMETERS})
-    assert table["id"].tolist() == [0, 1, 2, 3, 4] and (table["parent"] == NO_PARENT).all()
+    assert table["id"].tolist() == [0, 1, 2, 3, 4] and (table["parent"] == -1).all()
     assert not any(table[name].any() for name in ("last_step", "moment_step", "birth", "level"))
     with pytest.raises(ValueError, match=r"new rows lack the columns \['quats'\]"):
         GaussianTable.create({name: source[name] for name in PARAMETERS if name != "quats"})
@@ -118,17 +125,15 @@ def test_a_table_of_parameters_alone_holds_first_gaussians():
 def test_new_rows_without_a_column_that_was_added_later_are_refused():
     table, new = filled_table(5), filled_table(2, seed=2).columns
     table["phi"] = torch.arange(5.0)
-    refused(ValueError, r"new rows lack the columns \['phi'\]", table.append, new)
-    placement = place(5, torch.tensor([2]), torch.tensor([0, 1]), new["means"])
-    refused(ValueError, r"new rows lack the columns \['phi'\]", table.replace, placement, new)
-    table.append(new | table.inherited(torch.tensor([3, 1])))
+    refused(ValueError, r"new rows lack the columns \['phi'\]", append, table, new)
+    append(table, new | table.inherited(torch.tensor([3, 1])))
     assert table["phi"].tolist() == [0, 1, 2, 3, 4, 3, 1]
 
 
 def test_empty_table():
     table = filled_table(0)
     table.keep(torch.zeros(0, dtype=torch.bool))
-    table.append(filled_table(3).columns)
+    append(table, filled_table(3).columns)
     assert len(table) == 3
     assert_rows_whole(table)
 
@@ -169,9 +174,11 @@ def test_errors_name_the_column():
     with pytest.raises(ValueError, match=r"column 'means' must be torch.float32 \[4, 3\]"):
         GaussianTable({**columns, "means": torch.zeros(4, 2)})
     with pytest.raises(ValueError, match=r"rows lack the columns \['id'\]"):
-        filled_table(4).append({k: v for k, v in columns.items() if k != "id"})
+        append(filled_table(4), {k: v for k, v in columns.items() if k != "id"})
     with pytest.raises(ValueError, match=r"no columns \['colour'\]"):
-        filled_table(4).append({**columns, "colour": torch.zeros(4)})
+        append(filled_table(4), {**columns, "colour": torch.zeros(4)})
+    with pytest.raises(ValueError, match=r"no columns \['colour'\]"):
+        GaussianTable.create({name: columns[name] for name in PARAMETERS} | {"colour": torch.zeros(4)})
     refused(ValueError, r"mask must be bool \[4\]", filled_table(4).keep, torch.ones(3, dtype=torch.bool))
     refused(ValueError, r"order must be int64 \[4\]", filled_table(4).permute, torch.arange(3))
 

@@ -21,7 +21,7 @@ from blitzgs.table.blocks import BlockIndex
 from blitzgs.table.table import CULL, GaussianTable, sectors_in
 from blitzgs.training.batches import Batch
 from blitzgs.training.step import Stepper
-from blitzgs.view.gate import SAMPLE, LodGate, ModelGate, ViewGate, centres_of
+from blitzgs.view.gate import SAMPLE, LodGate, ModelGate, ViewGate, all_rows, centres_of
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.helpers import DEVICES, refused
 from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, allowed, make_table, make_views, seen
@@ -121,12 +121,7 @@ def test_images_are_those_of_the_gaussians_that_are_kept_with_blocks_and_without
     viewmats, Ks = make_views(device=device)
     gate = ViewGate(GATE.reach(), 0b1011, COLUMNS)
     with_blocks = BlockIndex(table).active(table, Views(viewmats, Ks, WIDTH, HEIGHT), (NEAR, FAR, 0.3))
-    count = len(table)
-    without = ActiveRows(
-        torch.arange(count, dtype=torch.int32, device=device),
-        torch.full((count,), 15, dtype=torch.int32, device=device),
-        torch.tensor([count], dtype=torch.int32, device=device),
-    )
+    without = all_rows(len(table), 4, table.device)
     for active in (with_blocks, without):
         gate_views_(active, table["means"], viewmats, gate.rules(table))
     images = render(table, viewmats, Ks, with_blocks)
