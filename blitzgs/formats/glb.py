@@ -79,7 +79,7 @@ def write_glb(path: Path, source: GaussianSource, up: tuple[float, float, float]
     room += -room % 4
     box = np.array([[np.inf] * 3, [-np.inf] * 3])
     with new_file(path) as partial, open(partial, "r+b") as file:
-        start, body = 0, 20 + room + 8
+        start, body = 0, 28 + room
         for block in source.blocks():
             block.check()
             box = around([box, torch.stack(block.means.aminmax(dim=0)).double().numpy()])
@@ -89,11 +89,8 @@ def write_glb(path: Path, source: GaussianSource, up: tuple[float, float, float]
             start += len(block)
         if start != count:
             raise ValueError(f"{path}: {count:,} Gaussians were announced, {start:,} came")
-        text = _json(source, columns, size, box, up).ljust(room)
         file.seek(0)
-        file.write(struct.pack("<4sIIII", b"glTF", 2, body + size, room, 0x4E4F534A))
-        file.write(text)
-        file.write(struct.pack("<II", size, 0x004E4942))
+        file.write(_head(_json(source, columns, size, box, up).ljust(room), size))
 
 
 def write_spz_glb(path: Path, model: Gaussians) -> None:
@@ -113,8 +110,13 @@ def write_spz_glb(path: Path, model: Gaussians) -> None:
     text = _json(model, columns, len(data), box, None)
     text, data = text.ljust(-(-len(text) // 4) * 4), data.ljust(-(-len(data) // 4) * 4, b"\0")
     with new_file(path) as partial:
-        head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(data), len(text), 0x4E4F534A)
-        partial.write_bytes(head + text + struct.pack("<II", len(data), 0x004E4942) + data)
+        partial.write_bytes(_head(text, len(data)) + data)
+
+
+def _head(text: bytes, size: int) -> bytes:
+    """Return what a GLB file has before its binary chunk of so many bytes; `text` is the JSON."""
+    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + size, len(text), 0x4E4F534A)
+    return head + text + struct.pack("<II", size, 0x004E4942)
 
 
 def _columns(count: int, degree: int, has_levels: bool) -> list[_Column]:

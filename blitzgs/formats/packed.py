@@ -292,7 +292,7 @@ def write_spz(path: Path, source: GaussianSource) -> None:
     with new_file(path) as partial, tempfile.TemporaryFile(dir=path.parent) as file:
         for block in unit_blocks(source):
             _gsply().write_spz(partial, _gsdata(_half_turn(block)), fractional_bits=bits)
-            content = zlib.decompress(partial.read_bytes(), wbits=31)
+            content = gzip.decompress(partial.read_bytes())
             if first == 0:
                 flags = content[14] | (_SPZ_ANTIALIASED if is_antialiased(source) else 0)
                 file.write(content[:8] + struct.pack("<I", count) + content[12:14] + bytes([flags, 0]))
@@ -310,7 +310,7 @@ def read_spz(path: Path) -> Gaussians:
         start = file.read(32)
     deflated = not start.startswith(b"NGSP")
     if deflated:
-        start = _inflated(path, 16, None)
+        start, _ = _inflated(path, 0)
     if len(start) < 16:
         raise ValueError(f"{path} is cut off: it has no whole header")
     magic, version, count, degree, _, flags = struct.unpack_from("<IIIBBB", start)
@@ -323,7 +323,11 @@ def read_spz(path: Path) -> Gaussians:
     if deflated:
         if size > _DEFLATE * path.stat().st_size:
             raise ValueError(f"{path}: {path.stat().st_size:,} bytes cannot hold {count:,} Gaussians")
-        _inflated(path, size, _SPZ_EXTENSIONS)
+        _, total = _inflated(path, size + _SPZ_EXTENSIONS)
+        if total > size + _SPZ_EXTENSIONS:
+            raise ValueError(f"{path} is damaged: it inflates to more than the {size:,} bytes it names")
+        if total < size:
+            raise ValueError(f"{path} is cut off: {total:,} of {size:,} bytes")
     try:
         found = _gsply().read_spz(path)
     except Exception as error:  # the package raises what its parts raise
@@ -345,25 +349,18 @@ def read_spz(path: Path) -> Gaussians:
     )
 
 
-def _inflated(path: Path, size: int, more: int | None) -> bytes:
-    """Return the first bytes of a deflated file; with `more`, check that it has `size` and so many more."""
-    inflate, start, total = zlib.decompressobj(31), b"", 0
+def _inflated(path: Path, most: int) -> tuple[bytes, int]:
+    """Return the first 16 bytes of a deflated file, and its length, counted until it is above `most`."""
+    start, total = b"", 0
     try:
-        with open(path, "rb") as file:
-            while not inflate.eof and (data := inflate.unconsumed_tail or file.read(1 << 20)):
-                part = inflate.decompress(data, 1 << 20)
-                start, total = start + part[: 16 - len(start)], total + len(part)
-                if more is None and len(start) == 16:
-                    return start
-                if more is not None and total > size + more:
-                    raise ValueError(
-                        f"{path} is damaged: it inflates to more than the {size:,} bytes it names"
-                    )
-    except zlib.error as error:
+        with gzip.open(path) as file:
+            while total <= most and (part := file.read(1 << 20)):
+                start, total = start or part[:16], total + len(part)
+    except EOFError as error:
+        raise ValueError(f"{path} is cut off: {error}") from error
+    except (gzip.BadGzipFile, zlib.error) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
-    if more is not None and (total < size or not inflate.eof):
-        raise ValueError(f"{path} is cut off: {total:,} of {size:,} bytes")
-    return start
+    return start, total
 
 
 def _half_turn(model: Gaussians) -> Gaussians:
