@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from blitzgs.formats.gaussians import Gaussians, GaussianSource, unit_quats
+from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased, unit_quats
 from blitzgs.util.rotations import quaternion_matrices
 from blitzgs.util.terminal import amount
 
@@ -67,10 +67,10 @@ class Partition:
     def _choose_grid(self) -> None:
         step = max(1, -(-len(self._source) // _SAMPLE))
         means = np.concatenate([chunk[::step] for chunk in self._chunks()]).astype(np.float64)
-        self.box = np.quantile(means, [0.002, 0.998], axis=0)
-        self.side = 1.05 * float(np.ptp(self.box, axis=0).max()) or 1.0
+        self._box = np.quantile(means, [0.002, 0.998], axis=0)
+        self._side = 1.05 * float(np.ptp(self._box, axis=0).max()) or 1.0
         # A flat scene is not cut along its short side.
-        self._origin, self._cell = self.box[0] - 0.02 * self.side, self.side / 2**BITS
+        self._origin, self._cell = self._box[0] - 0.02 * self._side, self._side / 2**BITS
 
     def _chunks(self) -> Iterator[_Places]:
         with open(self._places, "rb") as file:
@@ -83,15 +83,12 @@ class Partition:
         return interleaved(index, BITS)
 
     def _count(self) -> None:
-        codes, counts = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        # Keys of the occupied cells, sorted, and the number of Gaussians in each, int64 [E].
+        self.cells = self.counts = np.zeros(0, np.int64)
         for chunk in self._chunks():
             new, times = np.unique(self._codes(chunk), return_counts=True)
-            codes, inverse = np.unique(np.concatenate([codes, new]), return_inverse=True)
-            merged = np.zeros(len(codes), np.int64)
-            np.add.at(merged, inverse, np.concatenate([counts, times]))
-            counts = merged
-        # Keys of the occupied cells, sorted, and the number of Gaussians in each, int64 [E].
-        self.cells, self.counts = codes, counts
+            self.cells, place = np.unique(np.concatenate([self.cells, new]), return_inverse=True)
+            self.counts = np.bincount(place, np.concatenate([self.counts, times])).astype(np.int64)
 
     def place(self, parts: Ints) -> Parts:
         """Read the model again and sort its rows.
@@ -117,7 +114,8 @@ class Partition:
         if (position != starts[1:]).any():
             raise ValueError("the model changed between its two readings: write it when no training does")
         self._places.unlink()
-        return Parts(self._rows, self._width, self._source.comments, self._source.has_levels, starts)
+        known = (self._source.comments, self._source.has_levels, is_antialiased(self._source))
+        return Parts(self._rows, self._width, *known, self._box, self._side, starts)
 
 
 @dataclass(frozen=True)
@@ -128,6 +126,9 @@ class Parts:
     width: int  # numbers of a row
     comments: list[str]  # header lines of the model
     has_levels: bool  # whether the model has trained levels
+    antialiased: bool  # whether viewers compensate the screen-space blur
+    box: Array  # where nearly all of the model is, [2, 3]
+    side: float  # of the grid
     starts: Ints  # first row of each part, and the number of rows, int64 [P + 1]
 
     def read(self, part: int) -> Gaussians:
