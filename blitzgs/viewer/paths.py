@@ -12,8 +12,7 @@ import math
 import re
 import threading
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,39 +50,34 @@ class CameraPath:
     fps: float = 24.0  # frames a second
     seconds: float = 4.0  # duration of the film
     is_cycle: bool = False  # whether the last keyframe leads to the first
+    # All frames as another program computed them; empty: they follow from the keyframes.
+    played: list[Keyframe] = field(default_factory=list)
 
     def frames(self) -> list[Keyframe]:
         """Return the viewpoints of all frames: positions on a Catmull-Rom spline, rotations interpolated."""
+        if self.played:
+            return self.played
         count = max(1, round(self.fps * self.seconds))
         keys = self.keyframes + (self.keyframes[:1] if self.is_cycle else [])
-        if len(keys) < 2:
+        last = len(keys) - 1
+        if last < 1:
             return keys * count
-        times = np.linspace(0, len(keys) - 1, count, endpoint=not self.is_cycle)
-        return [interpolated(keys, float(time), self.is_cycle) for time in times]
-
-
-def interpolated(keys: Sequence[Keyframe], time: float, is_cycle: bool = False) -> Keyframe:
-    """Return the viewpoint at a time, counted in keyframes from 0."""
-    first = min(int(time), len(keys) - 2)
-    share, last = time - first, len(keys) - 1
-
-    def position(index: int) -> Array:
-        if is_cycle:  # the last keyframe is the first again
-            index %= last
-        return keys[min(max(index, 0), last)].camera_to_world[:3, 3]
-
-    p0, p1, p2, p3 = (position(first + shift) for shift in (-1, 0, 1, 2))
-    place = 0.5 * (
-        2 * p1
-        + (p2 - p0) * share
-        + (2 * p0 - 5 * p1 + 4 * p2 - p3) * share**2
-        + (3 * p1 - p0 - 3 * p2 + p3) * share**3
-    )
-    a, b = keys[first], keys[first + 1]
-    pose = np.eye(4)
-    pose[:3, :3] = _slerp(a.camera_to_world[:3, :3], b.camera_to_world[:3, :3], share)
-    pose[:3, 3] = place
-    return Keyframe(pose, a.fov + share * (b.fov - a.fov), a.aspect + share * (b.aspect - a.aspect))
+        places, frames = np.stack([key.camera_to_world[:3, 3] for key in keys]), []
+        for at in np.linspace(0, last, count, endpoint=not self.is_cycle).tolist():
+            first = min(int(at), last - 1)
+            share, around = at - first, first + np.arange(-1, 3)
+            p0, p1, p2, p3 = places[around % last if self.is_cycle else around.clip(0, last)]
+            a, b, pose = keys[first], keys[first + 1], np.eye(4)
+            pose[:3, :3] = _slerp(a.camera_to_world[:3, :3], b.camera_to_world[:3, :3], share)
+            pose[:3, 3] = 0.5 * (
+                2 * p1
+                + (p2 - p0) * share
+                + (2 * p0 - 5 * p1 + 4 * p2 - p3) * share**2
+                + (3 * p1 - p0 - 3 * p2 + p3) * share**3
+            )
+            fov, aspect = a.fov + share * (b.fov - a.fov), a.aspect + share * (b.aspect - a.aspect)
+            frames.append(Keyframe(pose, fov, aspect))
+        return frames
 
 
 def _slerp(a: Array, b: Array, share: float) -> Array:
@@ -107,7 +101,7 @@ def to_json(path: CameraPath) -> str:
         "seconds": path.seconds,
         "is_cycle": path.is_cycle,
         "smoothness_value": 0.0,
-        "default_fov": path.keyframes[0].fov if path.keyframes else 50.0,
+        "default_fov": path.keyframes[0].fov,
         "default_transition_sec": path.seconds / max(1, len(path.keyframes) - (not path.is_cycle)),
         "keyframes": keyframes,
         "camera_path": frames,
@@ -122,25 +116,18 @@ def from_json(text: str) -> CameraPath:
     ValueError: it is no camera path; the message says where and why.
     """
     content = _content(text)
-    keys = _viewpoints(content, "keyframes") or _viewpoints(content, "camera_path")
-    if not keys:
+    keys, played = _viewpoints(content, "keyframes"), _viewpoints(content, "camera_path")
+    if not (keys or played):
         raise ValueError(f"{_NO_PATH}: it has neither keyframes nor camera_path")
     return CameraPath(
-        keys,
+        keys or played,
         round(_number(content, "render_width", 1920, 1)),
         round(_number(content, "render_height", 1080, 1)),
         _number(content, "fps", 24.0, 0.01),
         _number(content, "seconds", 4.0, 0.0),
         bool(content.get("is_cycle", False)),
+        played,
     )
-
-
-def frames_from_json(text: str) -> list[Keyframe]:
-    """Return the frames that a path has as its program computed them; empty if it has only keyframes.
-
-    ValueError: as `from_json`.
-    """
-    return _viewpoints(_content(text), "camera_path")
 
 
 _NO_PATH = "this is no camera path in the layout of nerfstudio"
@@ -308,14 +295,13 @@ class Route:
     def load(self, content: bytes) -> None:
         """Take over a path from a file, and go to its first viewpoint."""
         try:
-            self.path = from_json(content.decode())
-        except (ValueError, UnicodeDecodeError) as error:
+            self.path = replace(from_json(content.decode()), played=[])
+        except ValueError as error:
             note(self._visitor, str(error))
             return
         self._seconds.value, self._cycle.value = self.path.seconds, self.path.is_cycle
         self._tell()
-        if self.path.keyframes:
-            self._visitor.go(self.stance_of(self.path.keyframes[0]))
+        self._visitor.go(self.stance_of(self.path.keyframes[0]))
 
 
 def save_beside(folder: Path, name: str, content: bytes | str) -> str:

@@ -129,7 +129,7 @@ def _of_degree(splats: Gaussians, degree: int) -> Gaussians:
 
 def _scene(opened: Opened) -> WebScene:
     exhibit, lod = opened.exhibit, opened.subject.lod
-    world = World(exhibit.space, exhibit.cameras, exhibit.box.mean(axis=0))
+    world = World(exhibit.space, exhibit.cameras, exhibit.box)
     return web_scene(world, opened.subject.options, 1.0, None if lod is None else _levels(lod))
 
 
@@ -217,7 +217,7 @@ def open_city(path: Path, checked: bool = True) -> City:
         config = Config(model=ModelConfig(antialiased=is_antialiased(source), near=1e-3))
     else:
         space, config = run.space, run.config
-    world = World(space, cameras, box.mean(axis=0) / space.unit)
+    world = World(space, cameras, box / space.unit)
     scene = web_scene(world, render_options(config, space, source.degree), space.unit)
     return City(source, offset, space.extent * space.unit, frame, scene, path.resolve().stem)
 

@@ -44,7 +44,7 @@ def test_up_is_found_for_ground_and_aerial_captures():
 
 
 def test_coordinates_go_there_and_back():
-    world = World(Space((500_000.0, 4e6, 30.0), 64.0, 1.5), [])
+    world = World(Space((500_000.0, 4e6, 30.0), 64.0, 1.5), [], BOX)
     pose = camera_at((0.1, 0.2, 0.3), (0.0, 0.0, 0.0))
     np.testing.assert_allclose(world.viewmat(world.stance(pose, 1.0)), pose, atol=1e-12)
     place = np.array([500_010.0, 4_000_001.0, 33.0])

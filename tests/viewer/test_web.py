@@ -50,7 +50,7 @@ def write_model(path, comments=(), degree=3, count=3000):
 
 def views(opened):
     """Yield viewmat and K: from outside, and from the midst of the Gaussians with an off-centre lens."""
-    world = World(opened.exhibit.space, (), opened.exhibit.box.mean(axis=0))
+    world = World(opened.exhibit.space, (), opened.exhibit.box)
     start = world.start()
     yield world.viewmat(start), intrinsics(WIDTH, HEIGHT, start.fov)
     inside = looking(world.middle + 0.2 * (start.position - world.middle), world.middle, world.up, 1.0)
