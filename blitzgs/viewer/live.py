@@ -151,7 +151,7 @@ class Live:
         if not self._paused and now >= self._refreshed + _REFRESH_SECONDS:
             self._refreshed = now
             for visitor in list(self.page.visitors.values()):
-                visitor.refresh()
+                visitor.is_stale = True
         found = self.page.next_ask()
         if found is None:
             self._allowed = now + _IDLE_SECONDS

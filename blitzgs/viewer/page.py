@@ -19,7 +19,7 @@ from blitzgs.viewer.door import Door, is_loopback
 from blitzgs.viewer.frustums import Frustums
 from blitzgs.viewer.panel import Panel, overlay
 from blitzgs.viewer.settings import MOVING_MS
-from blitzgs.viewer.visitor import Ask, Shown, Visitor
+from blitzgs.viewer.visitor import Ask, Visitor
 from blitzgs.viewer.world import Exhibit, World
 
 if TYPE_CHECKING:
@@ -65,10 +65,8 @@ class Page:
         self.exhibit, self.folders, self.memory = exhibit, folders, memory
         self.woken = threading.Event()  # set when a picture may be needed
         self.visitors: dict[int, Visitor] = {}  # those who look at present, by viser's numbers
-        self.panels: dict[int, Panel] = {}
         self.send_seconds = 0.0  # of a processor, that packing pictures has taken so far
         self._moving_ms = moving_ms
-        self._figured: dict[int, float] = {}
         self._turn = 0
         self._sender = ThreadPoolExecutor(1, "viewer sender")
         self._sending = threading.Semaphore(2)
@@ -107,19 +105,16 @@ class Page:
 
     def _enter(self, client: viser.ClientHandle) -> None:
         visitor = Visitor(client, self.world, self.exhibit, self.woken.set, self._moving_ms)
-        panel = Panel(visitor, self.frustums)
         if self.folders is not None:
             self.folders(client)
-        panel.build()
-        self.panels[client.client_id] = panel
+        Panel(visitor, self.frustums).build()
         self.visitors[client.client_id] = visitor
         self.woken.set()
 
     def _leave(self, client: viser.ClientHandle) -> None:
         visitor = self.visitors.pop(client.client_id, None)
         if visitor is not None:
-            visitor.leave()
-        self.panels.pop(client.client_id, None)
+            visitor.is_gone = True
         self.woken.set()
 
     def _stand(self, client_id: int | None, index: int) -> None:
@@ -152,7 +147,7 @@ class Page:
             self._sending.release()
 
     def _send(self, visitor: Visitor, ask: Ask, picture: Picture) -> None:
-        begin = time.thread_time()
+        begin, busy = time.monotonic(), time.thread_time()
         try:
             shown = visitor.take(ask, picture)
             if shown is None or visitor.client.client_id not in self.visitors:
@@ -162,22 +157,16 @@ class Page:
             visitor.client.scene.set_background_image(
                 shown.image, format="jpeg", jpeg_quality=88 if sharp else 70
             )
-            self._figures(visitor, shown, sharp)
+            if sharp or begin >= visitor.figured + _FIGURES_SECONDS:
+                visitor.figured = begin
+                visitor.figures.content = overlay(visitor, shown, self.memory())
         except Exception as error:
             # A browser that has gone, or one picture less: neither may end the page or a training.
             if visitor.client.client_id in self.visitors:
                 warn(f"the viewer could not send a picture: {error}")
         finally:
-            self.send_seconds += time.thread_time() - begin
+            self.send_seconds += time.thread_time() - busy
             self._sending.release()
-
-    def _figures(self, visitor: Visitor, shown: Shown, sharp: bool) -> None:
-        number, now = visitor.client.client_id, time.monotonic()
-        if not sharp and now < self._figured.get(number, 0.0) + _FIGURES_SECONDS:
-            return
-        self._figured[number] = now
-        if (panel := self.panels.get(number)) is not None:
-            panel.figures.content = overlay(visitor, shown, self.memory())
 
     def close(self) -> None:
         """Stop to serve."""

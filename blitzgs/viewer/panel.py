@@ -34,8 +34,6 @@ KEYS = "Keys: W A S D move level, Q down, E up, arrows turn. Click a frustum to 
 class Panel:
     """Builds the controls, and changes the visitor's settings as they are used."""
 
-    figures: Any  # the element with the figures over the picture
-
     def __init__(self, visitor: Visitor, frustums: Frustums) -> None:
         """Prepare the controls of a visitor."""
         self._visitor, self._frustums, self._exhibit = visitor, frustums, visitor.exhibit
@@ -43,7 +41,7 @@ class Panel:
 
     def build(self) -> None:
         """Add all controls."""
-        self.figures = self._gui.add_html("")
+        self._visitor.figures = self._gui.add_html("")
         with self._gui.add_folder("Show"):
             self._show()
         if self._exhibit.cameras:
@@ -186,7 +184,7 @@ class Panel:
             outline.dimensions = tuple(high - low)
             outline.position = (low + high) / 2
             outline.visible = crops.value
-            visitor.change(crops=crops.value, box=box)
+            visitor.change(crop=box if crops.value else None)
 
         for control in (crops, *sliders):
             control.on_update(update)

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -51,9 +51,9 @@ class Ask:
 class Shown:
     """The newest picture of a visitor, for the figures on the page and for screenshots."""
 
-    image: npt.NDArray[np.uint8]
     ask: Ask
     picture: Picture
+    image: npt.NDArray[np.uint8]  # [H, W, 3]; this and the rest as in `Shaded`
     low: float | None
     high: float | None
     psnr: float | None
@@ -88,8 +88,10 @@ class Visitor:
         self._moved, self._stance = 0.0, self._read()
         self._pace = Pace(moving_ms)
         self._sounded = -1
-        self._stale = False
-        self._gone = threading.Event()
+        self.is_stale = False  # the model has changed: another picture is wanted, as fine as the last
+        self.is_gone = False  # the browser has closed the page
+        self.figures: Any = None  # the element of the page with the figures over the picture
+        self.figured = 0.0  # when they were last updated
         self.listeners: list[Callable[[], None]] = []
         client.camera.on_update(self._on_camera)
 
@@ -183,10 +185,6 @@ class Visitor:
             distance = float(np.linalg.norm(self.stance.position - self.world.middle))
         self.go(self.stance, distance)
 
-    def refresh(self) -> None:
-        """Ask for a new picture of the same, as fine as the last, for a model that has changed."""
-        self._stale = True
-
     # -- pictures ------------------------------------------------------------------------------------------
 
     @property
@@ -203,49 +201,41 @@ class Visitor:
                 self._pace.next_scale(drawn, moving) if settings.adapts else (1.0 if drawn is None else None)
             )
             stance, index = self.stance, self.standing
-            if scale is None and self._stale and not moving:
+            if scale is None and self.is_stale and not moving:
                 scale = drawn
             if scale == 1.0:
-                self._stale = False
+                self.is_stale = False
             if scale is None:
                 if self.motion == "walk" and not moving and self._sounded != version:
                     self._sounded = version
                     return self._sounding(stance, version, settings)
                 return None
-        camera = self.client.camera
         try:
-            return self._ask(stance, index, camera.image_width, camera.image_height, scale, version, settings)
+            return self._ask(stance, index, scale, version, settings)
         except (ValueError, ArithmeticError):  # an impossible choice, such as a near plane behind the far one
             with self._lock:
                 self._drawn, self._drawn_scale = version, 1.0
             return None
 
-    def _ask(
-        self,
-        stance: Stance,
-        index: int | None,
-        width: int,
-        height: int,
-        scale: float,
-        version: int,
-        settings: Settings,
-    ) -> Ask:
+    def _ask(self, stance: Stance, index: int | None, scale: float, version: int, settings: Settings) -> Ask:
+        """Return what to draw; `index`: of the camera at which the visitor stands."""
         exposure = self.exhibit.exposures.get(index) if settings.exposure and index is not None else None
         if settings.comparison == "off" or self.exhibit.photograph is None:
             index = None
         elif index is None:
             settings = replace(settings, comparison="off")
-        columns = 1
-        share = scale * min(1.0, settings.most_side / max(width, height, 1))
-        w, h = max(16, round(width * share)), max(16, round(height * share))
-        if index is not None and settings.comparison == "side by side":
-            columns = compare.grid_columns(self.exhibit.cameras[index], w, h)
-            w, h = max(16, w // columns), max(16, h // compare.ROWS[columns])
+        sides = self.client.camera.image_width, self.client.camera.image_height
+        share = scale * min(1.0, settings.most_side / max(*sides, 1))
+        width, height = (max(16, round(side * share)) for side in sides)
+        columns, fov = 1, stance.fov
         if index is not None:
-            K = compare.fitted(self.exhibit.cameras[index], w, h)  # noqa: N806
-        else:
-            K = intrinsics(w, h, stance.fov)  # noqa: N806
-        look = settings.look(self.world.viewmat(stance), K, w, h)
+            camera = self.exhibit.cameras[index]
+            if settings.comparison == "side by side":
+                columns = compare.grid_columns(camera, width, height)
+                width, height = max(16, width // columns), max(16, height // compare.ROWS[columns])
+            fov = compare.fitting_fov(camera, width / height)
+        K = intrinsics(width, height, fov)  # noqa: N806
+        look = settings.look(self.world.viewmat(stance), K, width, height)
         return Ask(look, version, scale, settings, index, columns, exposure)
 
     def _sounding(self, stance: Stance, version: int, settings: Settings) -> Ask:
@@ -269,7 +259,7 @@ class Visitor:
                 self._drawn, self._drawn_scale = ask.version, ask.scale
             else:
                 return None
-        result, psnr = shaded(picture, ask.look.mode), None
+        result = shaded(picture, ask.look.mode)
         if ask.exposure is not None and ask.look.mode == "RGB":
             gain, bias = ask.exposure
             exposed = np.clip(result.image * gain + 255 * bias + 0.5, 0, 255).astype(np.uint8)
@@ -278,12 +268,10 @@ class Visitor:
             try:
                 photograph = self.exhibit.photograph(ask.camera)
             except (OSError, ValueError, RuntimeError):
-                return Shown(result.image, ask, picture, None, None, None)
-            camera = self.exhibit.cameras[ask.camera]
-            kind, wipe = ask.settings.comparison, ask.settings.wipe
-            compared = compare.compare(kind, result.image, photograph, camera, ask.look.K, wipe, ask.columns)
-            result, psnr = Shaded(compared.image), compared.psnr
-        return Shown(result.image, ask, picture, result.low, result.high, psnr)
+                return Shown(ask, picture, *result)
+            camera, kind, wipe = self.exhibit.cameras[ask.camera], ask.settings.comparison, ask.settings.wipe
+            result = compare.compare(kind, result.image, photograph, camera, ask.look.K, wipe, ask.columns)
+        return Shown(ask, picture, *result)
 
     def _step_to_ground(self, ask: Ask, picture: Picture) -> None:
         known = picture.values[picture.values > 0]
@@ -295,15 +283,6 @@ class Visitor:
             return
         stance = self.stance
         self.go(replace(stance, position=stance.position - self.world.up * (height - eye)))
-
-    @property
-    def is_gone(self) -> bool:
-        """Tell whether the browser has closed the page."""
-        return self._gone.is_set()
-
-    def leave(self) -> None:
-        """Note that the browser has closed the page."""
-        self._gone.set()
 
     def failed(self, ask: Ask, reason: str) -> None:
         """Note that a picture cannot be drawn, and tell the visitor; the next movement asks again."""

@@ -13,6 +13,7 @@ import torch
 
 from blitzgs.runs.cameras import RunCamera
 from blitzgs.util.rotations import quaternions
+from blitzgs.view.draw import intrinsics
 from blitzgs.view.look import Picture
 from blitzgs.view.views import Space
 from blitzgs.viewer import compare, paths
@@ -111,7 +112,7 @@ def test_a_photograph_lies_where_the_render_shows_its_pixels():
     same = compare.compare("wipe", photograph, photograph, camera, camera.K, 1.0)
     np.testing.assert_array_equal(same.image[:, :-2], photograph[:, :-2])
     assert same.psnr > 100
-    K = compare.fitted(camera, 120, 120)  # noqa: N806
+    K = intrinsics(120, 120, compare.fitting_fov(camera, 1.0))  # noqa: N806
     shown = compare.compare("error", np.zeros((120, 120, 3), np.uint8), photograph, camera, K)
     assert (shown.image[:14] == 0).all() and (shown.image[16:104] > 0).any()
     grid = compare.compare("side by side", photograph, photograph, camera, camera.K, columns=2)
