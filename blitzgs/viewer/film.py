@@ -111,7 +111,11 @@ class Film(CameraPath):
 
 
 def read_film(
-    source: str, size: tuple[int, int] | None, fps: float | None, seconds: float | None, moved: Path | None
+    source: str,
+    size: tuple[int, int] | None = None,
+    fps: float | None = None,
+    seconds: float | None = None,
+    moved: Path | None = None,
 ) -> Film:
     """Read the file of a path, or take the name of one that is made from the scene.
 
