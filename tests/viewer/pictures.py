@@ -28,6 +28,7 @@ from blitzgs.viewer.studio import Studio, open_model
 from blitzgs.viewer.web import web_file
 from blitzgs.viewer.world import looking
 from tests.browser import Browser, wait_for
+from tests.viewer.test_page import settled
 
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
 WIDTH = 1200
@@ -42,28 +43,20 @@ def save(browser: Browser, name: str) -> None:
     cv2.imwrite(str(IMAGES / name), image, [cv2.IMWRITE_JPEG_QUALITY, 82])
 
 
-def settle(visitor) -> None:  # noqa: ANN001
-    time.sleep(1)
-    wait_for(
-        lambda: visitor.shown.ask.scale == 1.0 and visitor.shown.ask.version == visitor.version, 120, "sharp"
-    )
-    time.sleep(1)
-
-
 def at_rest(run: Path, data: Path | None) -> None:
     studio = Studio(open_model(run, Ranks(), photographs(run, data)), port=0)
     with Browser(studio.page.url, 1600, 900) as browser:
         wait_for(browser.figures, 120, "a picture")
-        visitor = next(iter(studio.page.visitors.values()))
+        visitor = settled(studio)
         world, start = studio.page.world, studio.page.world.start()
         visitor.go(
             looking(world.middle + 1.15 * (start.position - world.middle), world.middle, world.up, 0.9), 5
         )
-        settle(visitor)
+        settled(studio)
         save(browser, "view_page.jpg")
         visitor.stand_at(studio.page.exhibit.test[len(studio.page.exhibit.test) // 2])
         visitor.change(comparison="wipe", wipe=0.5)
-        settle(visitor)
+        settled(studio)
         save(browser, "view_compare.jpg")
     studio.close()
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The viewer's parts without a browser: coordinates, films, comparisons, the door, the pace."""
 
+import contextlib
 import json
 import math
 import socket
@@ -9,10 +10,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 
 from blitzgs.runs.cameras import RunCamera
-from blitzgs.util.rotations import quaternions
 from blitzgs.view.draw import intrinsics
 from blitzgs.view.look import Picture
 from blitzgs.view.views import Space
@@ -36,6 +35,10 @@ def camera_at(position, target, up=(0.0, 0.0, 1.0)):
     return pose
 
 
+def pose(position, target):
+    return np.linalg.inv(camera_at(position, target))
+
+
 def test_up_is_found_for_ground_and_aerial_captures():
     ring = [camera_at((3 * math.sin(a), -1.0, 3 * math.cos(a)), (0, 0, 0), (0, -1, 0)) for a in range(8)]
     np.testing.assert_allclose(up_direction(ring), [0, -1, 0], atol=0.2)
@@ -46,23 +49,14 @@ def test_up_is_found_for_ground_and_aerial_captures():
 
 def test_coordinates_go_there_and_back():
     world = World(Space((500_000.0, 4e6, 30.0), 64.0, 1.5), [], BOX)
-    pose = camera_at((0.1, 0.2, 0.3), (0.0, 0.0, 0.0))
-    np.testing.assert_allclose(world.viewmat(world.stance(pose, 1.0)), pose, atol=1e-12)
+    viewmat = camera_at((0.1, 0.2, 0.3), (0.0, 0.0, 0.0))
+    np.testing.assert_allclose(world.viewmat(world.stance(viewmat, 1.0)), viewmat, atol=1e-12)
     place = np.array([500_010.0, 4_000_001.0, 33.0])
     np.testing.assert_allclose(world.capture_position(world.page_position(place)), place)
 
 
-def test_quaternions_turn_as_their_rotations():
-    for pose in (camera_at((1, 2, 3), (0, 0, 0)), np.diag([1.0, -1.0, -1.0, 1.0]), np.eye(4)):
-        w, x, y, z = quaternions(torch.from_numpy(pose[None, :3, :3]))[0].tolist()
-        forward = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
-        np.testing.assert_allclose(forward, pose[:3, 2], atol=1e-9)
-
-
 def key(angle, fov=50.0):
-    return paths.Keyframe(
-        np.linalg.inv(camera_at((math.sin(angle), math.cos(angle), 1), (0, 0, 0))), fov, 1.5
-    )
+    return paths.Keyframe(pose((math.sin(angle), math.cos(angle), 1), (0, 0, 0)), fov, 1.5)
 
 
 def test_a_path_survives_its_file():
@@ -185,15 +179,11 @@ def behind():
 def ask(port, path="/", host="localhost", extra="", method="GET"):
     with socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
         connection.sendall(f"{method} {path} HTTP/1.1\r\nHost: {host}\r\n{extra}\r\n".encode())
-        answer = b""
-        while chunk := connection.recv(65536):
-            answer += chunk
-    return answer.decode()
+        return connection.makefile().read()
 
 
 def test_the_door_without_a_token_is_for_this_machine(behind):
-    door = Door("127.0.0.1", 0, behind, "")
-    try:
+    with contextlib.closing(Door("127.0.0.1", 0, behind, "")) as door:
         assert "GET / HTTP/1.1" in ask(door.port, host=f"localhost:{door.port}")
         assert "GET /a?b" in ask(door.port, "/a?b", host="127.0.0.1:1")
         assert " 403 " in ask(door.port, host="evil.example")  # a name that was made to lead here
@@ -201,21 +191,16 @@ def test_the_door_without_a_token_is_for_this_machine(behind):
         assert " 403 " in ask(door.port, extra=upgrade)
         assert "200 OK" in ask(door.port, extra="Upgrade: websocket\r\nOrigin: http://localhost\r\n")
         assert " 405 " in ask(door.port, method="POST")
-    finally:
-        door.close()
 
 
 def test_the_door_with_a_token(behind):
-    door = Door("127.0.0.1", 0, behind, "secret")
-    try:
+    with contextlib.closing(Door("127.0.0.1", 0, behind, "secret")) as door:
         assert " 403 " in ask(door.port, host="machine")
         assert " 403 " in ask(door.port, "/secrets/", host="machine")
         assert " 403 " in ask(door.port, extra="Upgrade: websocket\r\n")
         assert "Location: /secret/" in ask(door.port, "/secret", host="machine")
         assert "GET /x HTTP/1.1" in ask(door.port, "/secret/x", host="machine")
         assert "GET / HTTP/1.1" in ask(door.port, "/secret", extra="Upgrade: websocket\r\n")
-    finally:
-        door.close()
 
 
 def test_a_port_in_use_is_an_error(behind):
@@ -242,10 +227,6 @@ def test_frustums_are_thinned_evenly_and_held_out_ones_keep_their_share():
 
 SPACE = Space((500.0, -200.0, 30.0), 4.0, 1.5)
 BOX = np.array([[-1.0, -1.0, -0.2], [1.0, 1.0, 0.2]])
-
-
-def pose(position, target):
-    return np.linalg.inv(camera_at(position, target))
 
 
 def aerial():
@@ -293,9 +274,7 @@ def test_a_path_of_nerfstudio_gives_its_cameras(tmp_path):
 
 
 def test_a_path_of_the_viewer_is_played_as_it_was_or_with_another_pace(tmp_path):
-    keys = [
-        paths.Keyframe(pose((3 * math.cos(a), 3 * math.sin(a), 2), (0, 0, 0)), 50.0, 1.5) for a in (0, 1, 2)
-    ]
+    keys = [key(angle) for angle in (0, 1, 2)]
     path = paths.CameraPath(keys, width=64, height=48, fps=10, seconds=0.5)
     file = tmp_path / "p.json"
     file.write_text(paths.to_json(path))
@@ -304,9 +283,8 @@ def test_a_path_of_the_viewer_is_played_as_it_was_or_with_another_pace(tmp_path)
     assert (film.width, film.height, film.fps) == (64, 48, 10)
     frames = film.cameras(nowhere, (), BOX)
     assert len(frames) == 5
-    for place, key in ((0, 0), (2, 1), (4, 2)):
-        found = np.linalg.inv(frames[place].world_to_camera)
-        np.testing.assert_allclose(found, keys[key].camera_to_world, atol=1e-9)
+    for frame, wanted in zip(frames[::2], keys, strict=True):
+        np.testing.assert_allclose(np.linalg.inv(frame.world_to_camera), wanted.camera_to_world, atol=1e-9)
     other = read_film(str(file), (32, 16), 30, 2)
     assert len(other.cameras(nowhere, (), BOX)) == 60 and (other.width, other.fps) == (32, 30)
 
