@@ -35,7 +35,7 @@ class Frustums:
         cameras, test = exhibit.cameras, set(exhibit.test)
         self.indices = shown_cameras(len(cameras), test)  # cameras that have a frustum
         self._handles: list[Any] = []
-        size = frustum_size(world)
+        self._size = frustum_size(world)
         for index in self.indices:
             camera = cameras[index]
             stance = world.stance(world.poses[index], world.fovs[index])
@@ -43,7 +43,7 @@ class Frustums:
                 f"/cameras/{index}",
                 fov=stance.fov,
                 aspect=camera.width / camera.height,
-                scale=size,
+                scale=self._size,
                 thickness=1.5,
                 thickness_units="screen",
                 color=TEST_COLOUR if index in test else TRAIN_COLOUR,
@@ -60,10 +60,10 @@ class Frustums:
         for handle in self._handles:
             handle.visible = visible
 
-    def resize(self, factor: float, world: World) -> None:
+    def resize(self, factor: float) -> None:
         """Draw the frustums larger or smaller than usual."""
         for handle in self._handles:
-            handle.scale = frustum_size(world) * factor
+            handle.scale = self._size * factor
 
 
 def shown_cameras(count: int, test: set[int]) -> list[int]:

@@ -31,7 +31,7 @@ class Curves:
         self.version = 0  # grows with every record
         self._total = total  # images of the whole run
         self._points: dict[str, list[tuple[int, float]]] = {name: [] for name in _SERIES}
-        self._held_out: list[tuple[int, float]] = []
+        self._held_out: float | None = None  # PSNR of the held-out views
         self._last: dict[str, Any] = {}
 
     def add(self, t: int, values: Mapping[str, Any]) -> None:
@@ -43,7 +43,7 @@ class Curves:
                     points.append((t, float(value)))
             self._last = {"t": t, **values}
         elif kind == "evaluation" and isinstance(psnr := values.get("psnr"), (int, float)):
-            self._held_out.append((t, float(psnr)))
+            self._held_out = float(psnr)
         elif kind == "pace":  # --minutes
             self._total = values["images"]
         else:
@@ -62,8 +62,8 @@ class Curves:
             parts.append(f"{last['psnr']:.2f} dB")
         if "images_per_second" in last:
             parts.append(f"{last['images_per_second']:.1f} images/s")
-        if self._held_out:
-            parts.append(f"held out: {self._held_out[-1][1]:.2f} dB")
+        if self._held_out is not None:
+            parts.append(f"held out: {self._held_out:.2f} dB")
         return " &middot; ".join(parts)
 
     def add_to(self, gui: Any) -> dict[str, Any]:

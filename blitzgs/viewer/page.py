@@ -107,7 +107,7 @@ class Page:
         visitor = Visitor(client, self.world, self.exhibit, self.woken.set, self._moving_ms)
         if self.folders is not None:
             self.folders(client)
-        Panel(visitor, self.frustums).build()
+        Panel(visitor, self.frustums)
         self.visitors[client.client_id] = visitor
         self.woken.set()
 

@@ -32,29 +32,27 @@ KEYS = "Keys: W A S D move level, Q down, E up, arrows turn. Click a frustum to 
 
 
 class Panel:
-    """Builds the controls, and changes the visitor's settings as they are used."""
+    """The controls of a visitor, which change the visitor's settings as they are used."""
 
     def __init__(self, visitor: Visitor, frustums: Frustums) -> None:
-        """Prepare the controls of a visitor."""
-        self._visitor, self._frustums, self._exhibit = visitor, frustums, visitor.exhibit
-        self._gui: Any = visitor.client.gui
-
-    def build(self) -> None:
         """Add all controls."""
-        self._visitor.figures = self._gui.add_html("")
-        with self._gui.add_folder("Show"):
+        self._visitor, self._frustums, self._exhibit = visitor, frustums, visitor.exhibit
+        gui: Any = visitor.client.gui
+        self._gui = gui
+        visitor.figures = gui.add_html("")
+        with gui.add_folder("Show"):
             self._show()
         if self._exhibit.cameras:
-            with self._gui.add_folder("Photographs"):
+            with gui.add_folder("Photographs"):
                 self._photographs()
-        with self._gui.add_folder("Move"):
+        with gui.add_folder("Move"):
             self._move()
-        with self._gui.add_folder("Model", expand_by_default=False):
+        with gui.add_folder("Model", expand_by_default=False):
             self._model()
-        with self._gui.add_folder("Crop box", expand_by_default=False):
+        with gui.add_folder("Crop box", expand_by_default=False):
             self._crop()
-        with self._gui.add_folder("Viewpoints and path", expand_by_default=False):
-            Route(self._visitor, self._gui).build()
+        with gui.add_folder("Viewpoints and path", expand_by_default=False):
+            Route(visitor, gui)
 
     def _bind(self, control: Any, choice: str, convert: Callable[[Any], Any] = lambda value: value) -> None:
         """Change a field of the visitor's settings whenever a control is used."""
@@ -76,7 +74,7 @@ class Panel:
         if (few := len(self._frustums.indices)) < len(exhibit.cameras):
             gui.add_markdown(f"{few} of {len(exhibit.cameras):,} are shown; *Camera* below reaches all.")
         size = gui.add_slider("Camera size", min=0.1, max=4.0, step=0.1, initial_value=1.0)
-        size.on_update(lambda _: self._frustums.resize(size.value, visitor.world))
+        size.on_update(lambda _: self._frustums.resize(size.value))
         number = gui.add_slider(
             "Camera", min=0, max=max(1, len(exhibit.cameras) - 1), step=1, initial_value=0
         )

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import threading
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -197,111 +196,96 @@ RECORD_SECONDS = 0.5
 
 
 class Route:
-    """The path that one visitor makes."""
+    """The path that one visitor makes, and the controls for it."""
 
     def __init__(self, visitor: Visitor, gui: Any) -> None:
-        """Begin with an empty path."""
-        self._visitor, self._gui = visitor, gui
-        self.path = CameraPath()
+        """Add the controls; the path is empty."""
+        self._visitor = visitor
+        self._path = CameraPath()
         self._noted = 0.0
-        self._playing = threading.Event()
-
-    def build(self) -> None:
-        """Add the controls."""
-        gui = self._gui
+        self._plays = False
         self._count = gui.add_markdown("No viewpoint yet")
-        gui.add_button("Add viewpoint").on_click(lambda _: self.add())
+        gui.add_button("Add viewpoint").on_click(lambda _: self._add())
         self._records = gui.add_checkbox("Record movement", False, hint="A viewpoint every half second")
         self._seconds = gui.add_number("Seconds", 4.0, min=0.1, max=3600.0, step=0.5)
         self._cycle = gui.add_checkbox("Closed", False)
-        gui.add_button("Play").on_click(lambda _: self.play())
+        gui.add_button("Play").on_click(lambda _: self._play())
         self._name = gui.add_text("Name", "path")
-        gui.add_button("Save path").on_click(lambda _: self.save())
-        gui.add_button("Remove the last").on_click(lambda _: self.remove())
-        gui.add_button("Clear").on_click(lambda _: self.clear())
+        gui.add_button("Save path").on_click(lambda _: self._save())
+        gui.add_button("Remove the last").on_click(lambda _: self._cut(-1))
+        gui.add_button("Clear").on_click(lambda _: self._cut(0))
         upload = gui.add_upload_button("Load a path", mime_type="application/json")
-        upload.on_upload(lambda _: self.load(upload.value.content))
-        self._visitor.listeners.append(self._moved)
+        upload.on_upload(lambda _: self._load(upload.value.content))
+        visitor.listeners.append(self._moved)
 
-    def add(self) -> None:
-        """Add the present viewpoint."""
+    def _add(self) -> None:
         visitor = self._visitor
         stance, aspect = visitor.stance, visitor.client.camera.aspect
         pose = visitor.world.capture_pose(stance)
-        self.path.keyframes.append(Keyframe(pose, math.degrees(stance.fov), aspect))
+        self._path.keyframes.append(Keyframe(pose, math.degrees(stance.fov), aspect))
         self._tell()
 
     def _moved(self) -> None:
-        if (
-            self._records.value
-            and time.monotonic() > self._noted + RECORD_SECONDS
-            and not self._playing.is_set()
-        ):
-            self._noted = time.monotonic()
-            self.add()
+        now = time.monotonic()
+        if self._records.value and now > self._noted + RECORD_SECONDS and not self._plays:
+            self._noted = now
+            self._add()
 
-    def remove(self) -> None:
-        """Remove the last viewpoint."""
-        if self.path.keyframes:
-            self.path.keyframes.pop()
-        self._tell()
-
-    def clear(self) -> None:
-        """Remove all viewpoints."""
-        self.path.keyframes.clear()
+    def _cut(self, first: int) -> None:
+        """Remove the viewpoints from one on."""
+        del self._path.keyframes[first:]
         self._tell()
 
     def _tell(self) -> None:
-        count = len(self.path.keyframes)
+        count = len(self._path.keyframes)
         self._count.content = f"{count} viewpoint{'s' * (count != 1)}"
 
-    def stance_of(self, key: Keyframe) -> Stance:
-        """Return a viewpoint in the page's coordinates."""
+    def _go(self, key: Keyframe) -> None:
+        """Move the visitor to a viewpoint."""
         pose = key.camera_to_world
         position = self._visitor.world.page_position(pose[:3, 3])
-        return Stance(position, pose[:3, :3].copy(), math.radians(key.fov))
+        self._visitor.go(Stance(position, pose[:3, :3].copy(), math.radians(key.fov)))
 
-    def _timed(self) -> CameraPath:
-        self.path.seconds, self.path.is_cycle = float(self._seconds.value), bool(self._cycle.value)
-        return self.path
+    def _timed(self) -> CameraPath | None:
+        """Return the path as the controls say; without viewpoints, tell the visitor, and return None."""
+        if not self._path.keyframes:
+            note(self._visitor, "add a viewpoint first")
+            return None
+        self._path.seconds, self._path.is_cycle = float(self._seconds.value), bool(self._cycle.value)
+        return self._path
 
-    def play(self) -> None:
+    def _play(self) -> None:
         """Move the visitor along the path, or stop if it is being played."""
-        if self._playing.is_set():
-            self._playing.clear()
+        if self._plays or (path := self._timed()) is None:
+            self._plays = False
             return
-        if not self.path.keyframes:
-            note(self._visitor, "add a viewpoint first")
-            return
-        self._playing.set()
-        frames, begin = self._timed().frames(), time.monotonic()
-        while self._playing.is_set():
-            index = int((time.monotonic() - begin) * self.path.fps)
-            if index >= len(frames) or self._visitor.is_gone:
+        self._plays = True
+        frames, begin = path.frames(), time.monotonic()
+        while self._plays and not self._visitor.is_gone:
+            index = int((time.monotonic() - begin) * path.fps)
+            if index >= len(frames):
                 break
-            self._visitor.go(self.stance_of(frames[index]))
+            self._go(frames[index])
             time.sleep(0.05)
-        self._playing.clear()
+        self._plays = False
 
-    def save(self) -> None:
+    def _save(self) -> None:
         """Write the path beside the run, and give it to the browser."""
-        if not self.path.keyframes:
-            note(self._visitor, "add a viewpoint first")
-            return
-        text, name = to_json(self._timed()), safe_name(self._name.value) + ".json"
-        self._visitor.client.send_file_download(name, text.encode(), save_immediately=True)
-        note(self._visitor, save_beside(self._visitor.exhibit.paths, name, text))
+        if (path := self._timed()) is not None:
+            text, name = to_json(path), safe_name(self._name.value) + ".json"
+            self._visitor.client.send_file_download(name, text.encode(), save_immediately=True)
+            note(self._visitor, save_beside(self._visitor.exhibit.paths, name, text))
 
-    def load(self, content: bytes) -> None:
+    def _load(self, content: bytes) -> None:
         """Take over a path from a file, and go to its first viewpoint."""
         try:
-            self.path = replace(from_json(content.decode()), played=[])
+            self._path = replace(from_json(content.decode()), played=[])
         except ValueError as error:
             note(self._visitor, str(error))
             return
-        self._seconds.value, self._cycle.value = self.path.seconds, self.path.is_cycle
+        self._seconds.value, self._cycle.value = self._path.seconds, self._path.is_cycle
         self._tell()
-        self._visitor.go(self.stance_of(self.path.keyframes[0]))
+        self._go(self._path.keyframes[0])
 
 
 def save_beside(folder: Path, name: str, content: bytes | str) -> str:

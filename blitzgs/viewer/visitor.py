@@ -80,12 +80,12 @@ class Visitor:
         self.shown: Shown | None = None  # the newest picture
         self.motion = "orbit"  # "orbit", "fly" or "walk"
         self.standing: int | None = None
-        self._place: Stance | None = None  # of the camera at which the visitor stands
         self._arrived = 0.0
         self._lock = threading.Lock()
         self.version, self._drawn = 0, -1
         self._drawn_scale = 0.0
         self._moved, self._stance = 0.0, self._read()
+        self._place = self._stance  # of the camera at which the visitor stands
         self._pace = Pace(moving_ms)
         self._sounded = -1
         self.is_stale = False  # the model has changed: another picture is wanted, as fine as the last
@@ -100,7 +100,7 @@ class Visitor:
     @property
     def stance(self) -> Stance:
         """Where the visitor is; exactly the photograph's camera for one who stands there."""
-        return self._place if self.standing is not None and self._place is not None else self._stance
+        return self._stance if self.standing is None else self._place
 
     def _read(self) -> Stance:
         camera = self.client.camera
@@ -113,7 +113,7 @@ class Visitor:
         with self._lock:
             same = stance.is_near(self._stance, 1e-6, 1e-6) and stance.fov == self._stance.fov
             self._stance = stance
-            if self.standing is not None and self._place is not None:
+            if self.standing is not None:
                 here = stance.is_near(self._place, 0.02, 0.01)
                 if here or time.monotonic() < self._arrived + _ARRIVING_SECONDS:
                     return
