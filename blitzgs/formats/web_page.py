@@ -85,7 +85,7 @@ def packed(splats: Gaussians) -> bytes:
     planes += [places & 255, places >> 8, sizes, tints, _quaternion_bytes(splats)]
     planes.append(np.rint(splats.opacities.sigmoid()[:, None].double().numpy() * 255))
     if splats.levels is not None:
-        planes.append(splats.levels[:, None].numpy())
+        planes.append(splats.levels[:, None].byte().numpy())
     rest = sh[:, 1:].reshape(len(splats), -1)
     planes.append(np.rint(rest / HARMONIC).clip(-127, 127).astype(np.int8).view(np.uint8))
     content = b"".join(
