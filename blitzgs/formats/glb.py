@@ -83,7 +83,7 @@ def write_glb(path: Path, source: GaussianSource, up: tuple[float, float, float]
         for block in source.blocks():
             block.check()
             box = around([box, torch.stack(block.means.aminmax(dim=0)).double().numpy()])
-            for column, values in zip(columns, _values(block, path), strict=True):
+            for column, values in zip(columns, _values(block).values(), strict=True):
                 file.seek(body + column.offset + column.width * start)
                 file.write(np.ascontiguousarray(values).data)
             start += len(block)
@@ -120,42 +120,36 @@ def _head(text: bytes, size: int) -> bytes:
 
 
 def _columns(count: int, degree: int, has_levels: bool) -> list[_Column]:
-    kinds = [("POSITION", "VEC3", _FLOAT, 12), (f"{_PREFIX}ROTATION", "VEC4", _FLOAT, 16)]
-    kinds += [(f"{_PREFIX}SCALE", "VEC3", _FLOAT, 12), (f"{_PREFIX}OPACITY", "SCALAR", _FLOAT, 4)]
-    kinds += [("COLOR_0", "VEC4", _BYTE, 4)]
-    kinds += [
-        (f"{_PREFIX}SH_DEGREE_{d}_COEF_{n}", "VEC3", _FLOAT, 12)
-        for d in range(degree + 1)
-        for n in range(2 * d + 1)
-    ]
-    if has_levels:
-        kinds.append(("_LEVEL", "SCALAR", _FLOAT, 4))
+    none, k = torch.empty(0), (degree + 1) ** 2
+    empty = Gaussians(
+        none.view(0, 3), none.view(0, 4), none.view(0, 3), none, torch.empty(0, k, 3),
+        levels=none if has_levels else None,
+    )  # fmt: skip
     columns, offset = [], 0
-    for name, type_, component, width in kinds:
-        columns.append(_Column(name, type_, component, offset, width))
-        offset += width * count
+    for name, values in _values(empty).items():
+        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]]
+        component = _BYTE if values.dtype == np.uint8 else _FLOAT
+        columns.append(_Column(name, kind, component, offset, values.itemsize * values.shape[1]))
+        offset += columns[-1].width * count
     return columns
 
 
-def _values(block: Gaussians, path: Path) -> list[Array]:
-    """Return the columns of a block in the order of `_columns`."""
-    opacities = block.opacities.double().sigmoid().numpy()
-    scales = block.scales.exp().numpy()
-    sh = block.sh.numpy()
-    for name, values in (("scales", scales), ("sh", sh)):
-        if not np.isfinite(values).all():
-            raise ValueError(f"{path}: {name} are not finite in float32, which glTF requires")
-    colors = np.concatenate([0.5 + SH_C0 * sh[:, 0], opacities[:, None]], axis=1)
-    columns: list[Array] = [
-        block.means.numpy(),
-        unit_quats(block.quats)[:, [1, 2, 3, 0]].float().numpy(),
-        scales,
-        opacities.astype(np.float32),
-        np.rint(colors.clip(0, 1) * 255).astype(np.uint8),
-        *(sh[:, k] for k in range(sh.shape[1])),
-    ]
+def _values(block: Gaussians) -> dict[str, Array]:
+    """Return the columns of a block in the order of the file, float32 or uint8 [N, C]."""
+    opacities = block.opacities[:, None].double().sigmoid().numpy()
+    colors = np.concatenate([0.5 + SH_C0 * block.sh[:, 0].numpy(), opacities], axis=1)
+    columns: dict[str, Array] = {
+        "POSITION": block.means.numpy(),
+        f"{_PREFIX}ROTATION": unit_quats(block.quats)[:, [1, 2, 3, 0]].float().numpy(),
+        f"{_PREFIX}SCALE": block.scales.exp().numpy(),
+        f"{_PREFIX}OPACITY": opacities.astype(np.float32),
+        "COLOR_0": np.rint(colors.clip(0, 1) * 255).astype(np.uint8),
+    }
+    for d in range(block.degree + 1):
+        for n in range(2 * d + 1):
+            columns[f"{_PREFIX}SH_DEGREE_{d}_COEF_{n}"] = block.sh[:, d * d + n].numpy()
     if block.levels is not None:
-        columns.append(block.levels.float().numpy())
+        columns["_LEVEL"] = block.levels[:, None].float().numpy()
     return columns
 
 
