@@ -13,7 +13,7 @@ import errno
 import math
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -100,11 +100,9 @@ class Partition:
         with open(self._rows, "wb") as file:
             for block in self._source.blocks():
                 found = parts[np.searchsorted(self.cells, self._codes(block.means.numpy()))]
-                rows = np.empty((len(block), self._width), "<f4")
-                rows[:, 0:3], rows[:, 3:7] = block.means.numpy(), block.quats.numpy()
-                rows[:, 7:10], rows[:, 10] = block.scales.numpy(), block.opacities.numpy()
-                rows[:, 11] = 0 if block.levels is None else block.levels.numpy()
-                rows[:, 12:] = block.sh.reshape(len(block), -1).numpy()
+                levels = torch.zeros(len(block)) if block.levels is None else block.levels
+                columns = [block.means, block.quats, block.scales, block.opacities[:, None], levels[:, None]]
+                rows = torch.cat([*columns, block.sh.flatten(1)], dim=1).numpy()
                 by_part = np.argsort(found, kind="stable")
                 present, firsts = np.unique(found[by_part], return_index=True)
                 for one, some in zip(present, np.split(by_part, firsts[1:]), strict=True):
@@ -134,15 +132,12 @@ class Parts:
     def read(self, part: int) -> Gaussians:
         """Read the Gaussians of a part."""
         begin, end = int(self.starts[part]), int(self.starts[part + 1])
-        values = np.fromfile(
-            self.file, "<f4", (end - begin) * self.width, offset=4 * self.width * begin
-        ).reshape(-1, self.width)
-        rows = torch.from_numpy(values)
-        return Gaussians(
-            means=rows[:, 0:3], quats=rows[:, 3:7], scales=rows[:, 7:10], opacities=rows[:, 10],
-            sh=rows[:, 12:].reshape(len(rows), -1, 3), comments=self.comments,
-            levels=rows[:, 11] if self.has_levels else None,
-        )  # fmt: skip
+        count = (end - begin) * self.width
+        rows = torch.from_numpy(np.fromfile(self.file, "<f4", count, offset=4 * self.width * begin))
+        columns = rows.view(-1, self.width).split([3, 4, 3, 1, 1, self.width - 12], dim=1)
+        means, quats, scales, opacities, levels, sh = columns
+        found = Gaussians(means, quats, scales, opacities[:, 0], sh.unflatten(1, (-1, 3)))
+        return replace(found, comments=self.comments, levels=levels[:, 0] if self.has_levels else None)
 
 
 def interleaved(index: Ints, bits: int) -> Ints:
