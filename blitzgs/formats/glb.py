@@ -203,14 +203,9 @@ def _json(
             {"buffer": 0, "byteOffset": c.offset, "byteLength": c.width * count, "target": 34962}
             for c in columns
         ]
-        content["nodes"] = [{"mesh": 0, "rotation": _rotation_to_y(up)}]
+        w, x, y, z = quaternions(torch.from_numpy(shortest_turn(up, 1))[None])[0].tolist()
+        content["nodes"] = [{"mesh": 0, "rotation": [x, y, z, w]}]
     return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
-
-
-def _rotation_to_y(up: tuple[float, float, float]) -> list[float]:
-    """Return the shortest rotation from `up` to +Y as x, y, z, w; half a turn about x from -Y."""
-    w, x, y, z = quaternions(torch.from_numpy(shortest_turn(up, 1))[None])[0].tolist()
-    return [x, y, z, w]
 
 
 def shortest_turn(direction: tuple[float, float, float], axis: int) -> npt.NDArray[np.float64]:

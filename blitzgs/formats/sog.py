@@ -69,7 +69,8 @@ def write_sog(path: Path, source: GaussianSource) -> None:
         places = (shares * 65535).round().int().numpy()
         codes["means_l"][rows], codes["means_u"][rows] = places & 255, places >> 8
         codes["scales"][rows] = _labels(block.scales, scales_book)
-        codes["quats"][rows] = _quats(block.quats)
+        others, largest = without_largest(block.quats, 8)
+        codes["quats"][rows] = torch.cat([others, 252 + largest[:, None]], dim=1).numpy()
         codes["sh0"][rows, :3] = _labels(block.sh[:, 0], colors_book)
         codes["sh0"][rows, 3] = (block.opacities.double().sigmoid() * 255).round().numpy()
         if palette is not None:
@@ -212,12 +213,6 @@ def _nearest(rows: Tensor, centres: Tensor) -> Tensor:
     lengths = (centres**2).sum(dim=1) / 2
     parts = rows.split(max(1, _TABLE // len(centres)))
     return torch.cat([torch.addmm(lengths, part, centres.T, alpha=-1).argmin(dim=1) for part in parts])
-
-
-def _quats(quats: Tensor) -> Bytes:
-    """Return unit quaternions as three bytes of the smaller components and one of the omitted one, [N, 4]."""
-    others, largest = without_largest(quats, 8)
-    return torch.cat([others, 252 + largest[:, None]], dim=1).to(torch.uint8).numpy()
 
 
 def read_sog(path: Path) -> Gaussians:

@@ -66,12 +66,11 @@ def compare(
     brightness = np.clip(np.abs(difference).mean(axis=2) / (255 * _BRIGHTEST), 0, 1)
     error = _coloured(brightness, cv2.COLORMAP_INFERNO)
     if kind == "side by side":
-        parts = [
-            _labelled(placed, "photograph"),
-            _labelled(render * seen, "render"),
-            _labelled(error, "error"),
-        ]
-        return Shaded(_gridded(parts, columns), psnr=psnr)
+        pictures = {"photograph": placed, "render": render * seen, "error": error}
+        parts = [_labelled(picture, name) for name, picture in pictures.items()]
+        parts += [np.zeros_like(error)] * (columns * ROWS[columns] - len(parts))
+        rows = [np.concatenate(parts[k : k + columns], axis=1) for k in range(0, len(parts), columns)]
+        return Shaded(np.concatenate(rows), psnr=psnr)
     dark = (render * 0.35).astype(np.uint8)  # outside of the photograph
     shown = np.where(seen, error if kind == "error" else render, dark)
     if kind == "wipe":
@@ -93,14 +92,6 @@ def grid_columns(camera: CameraLike, width: int, height: int) -> int:
         return min(width / columns / camera.width, height / ROWS[columns] / camera.height)
 
     return max(ROWS, key=scale)
-
-
-def _gridded(parts: list[UInt8], columns: int) -> UInt8:
-    """Put images of one size into a grid, row by row."""
-    count = columns * ROWS[columns]
-    cells = parts + [np.zeros_like(parts[0])] * (count - len(parts))
-    rows = [np.concatenate(cells[k : k + columns], axis=1) for k in range(0, count, columns)]
-    return np.concatenate(rows, axis=0)
 
 
 def _placed(
@@ -127,7 +118,7 @@ def _placed(
 
 
 def _labelled(image: UInt8, text: str) -> UInt8:
-    """Return a copy of an image with a text in its upper left corner."""
+    """Return an image with a text in its upper left corner."""
     out = np.ascontiguousarray(image)
     size = max(0.4, image.shape[1] / 900)
     place, font = (12, int(14 + 26 * size)), cv2.FONT_HERSHEY_SIMPLEX

@@ -67,7 +67,9 @@ class CameraPath:
             share, around = at - first, first + np.arange(-1, 3)
             p0, p1, p2, p3 = places[around % last if self.is_cycle else around.clip(0, last)]
             a, b, pose = keys[first], keys[first + 1], np.eye(4)
-            pose[:3, :3] = _slerp(a.camera_to_world[:3, :3], b.camera_to_world[:3, :3], share)
+            # The rotation turns about one axis.
+            turn = cv2.Rodrigues(a.camera_to_world[:3, :3].T @ b.camera_to_world[:3, :3])[0]
+            pose[:3, :3] = a.camera_to_world[:3, :3] @ cv2.Rodrigues(share * turn)[0]
             pose[:3, 3] = 0.5 * (
                 2 * p1
                 + (p2 - p0) * share
@@ -77,13 +79,6 @@ class CameraPath:
             fov, aspect = a.fov + share * (b.fov - a.fov), a.aspect + share * (b.aspect - a.aspect)
             frames.append(Keyframe(pose, fov, aspect))
         return frames
-
-
-def _slerp(a: Array, b: Array, share: float) -> Array:
-    """Turn from rotation `a` to `b` about one axis by a share of the angle."""
-    turn = cv2.Rodrigues(a.T @ b)[0]
-    turned: Array = a @ cv2.Rodrigues(share * turn)[0]
-    return turned
 
 
 def to_json(path: CameraPath) -> str:

@@ -187,15 +187,11 @@ class Visitor:
 
     # -- pictures ------------------------------------------------------------------------------------------
 
-    @property
-    def is_moving(self) -> bool:
-        """Tell whether the camera moved just now."""
-        return time.monotonic() < self._moved + STILL_SECONDS
-
     def next_ask(self) -> Ask | None:
         """Return what to draw next; None: nothing at present."""
         with self._lock:
-            moving, version, settings = self.is_moving, self.version, self.settings
+            moving = time.monotonic() < self._moved + STILL_SECONDS
+            version, settings = self.version, self.settings
             drawn = self._drawn_scale if self._drawn == version else None
             scale = (
                 self._pace.next_scale(drawn, moving) if settings.adapts else (1.0 if drawn is None else None)
