@@ -113,7 +113,8 @@ class Panel:
         tell()
 
     def _move(self) -> None:
-        visitor, gui = self._visitor, self._gui
+        visitor, gui, world = self._visitor, self._gui, self._visitor.world
+        start = world.start()
         motion = gui.add_button_group("Motion", tuple(MOTIONS))
         fov = gui.add_slider(
             "Field of view", min=10, max=110, step=1, initial_value=50, hint="Vertical, degrees"
@@ -124,7 +125,7 @@ class Panel:
 
         fov.on_update(turn)
         gui.add_button("Level the horizon").on_click(lambda _: visitor.go(visitor.stance))
-        gui.add_button("Back to the start").on_click(lambda _: self._restart())
+        gui.add_button("Back to the start").on_click(lambda _: visitor.go(start, world.distance(start)))
         help_text = gui.add_markdown("")
 
         def moves(_: Any) -> None:
@@ -136,11 +137,6 @@ class Panel:
 
         motion.on_click(moves)
         tell()
-
-    def _restart(self) -> None:
-        world = self._visitor.world
-        start = world.start()
-        self._visitor.go(start, float(np.linalg.norm(start.position - world.middle)))
 
     def _model(self) -> None:
         gui, exhibit = self._gui, self._exhibit
@@ -248,7 +244,7 @@ def scale_bar(visitor: Visitor) -> str:
     camera = visitor.client.camera
     distance = float(np.linalg.norm(np.array(camera.look_at) - np.array(camera.position)))
     if visitor.motion != "orbit":
-        distance = float(np.linalg.norm(visitor.world.middle - visitor.stance.position))
+        distance = visitor.world.distance(visitor.stance)
     # Height of the view at this distance in the capture's unit, or in metres if these are known. The picture
     # is as high as the page; beside the panel it is less wide.
     frame, unit = visitor.exhibit.frame, visitor.exhibit.space.unit

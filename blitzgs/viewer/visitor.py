@@ -159,14 +159,12 @@ class Visitor:
     def stand_at(self, index: int) -> None:
         """Put the visitor where a photograph was taken."""
         camera = self.exhibit.cameras[index]
-        pose = self.world.poses[index]
         fov = compare.fitting_fov(camera, self.client.camera.aspect)
-        stance = self.world.stance(pose, fov)
-        distance = float(np.linalg.norm(stance.position - self.world.middle))
+        stance = self.world.stance(self.world.poses[index], fov)
         with self._lock:
             self.standing, self._place, self._arrived = index, stance, time.monotonic()
             self.version += 1
-        self.go(stance, max(0.1, distance), up=-stance.rotation[:, 1])
+        self.go(stance, max(0.1, self.world.distance(stance)), up=-stance.rotation[:, 1])
         self._wake()
         self._tell()
 
@@ -180,10 +178,7 @@ class Visitor:
     def choose_motion(self, motion: str) -> None:
         """Choose how the camera moves: "orbit", "fly" or "walk"."""
         self.motion = motion
-        distance = None
-        if motion == "orbit":
-            distance = float(np.linalg.norm(self.stance.position - self.world.middle))
-        self.go(self.stance, distance)
+        self.go(self.stance, self.world.distance(self.stance) if motion == "orbit" else None)
 
     # -- pictures ------------------------------------------------------------------------------------------
 

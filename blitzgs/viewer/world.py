@@ -70,6 +70,10 @@ class World:
         rotation = pose[:3, :3].T
         return Stance(-rotation @ pose[:3, 3] * SCALE, rotation.copy(), fov)
 
+    def distance(self, stance: Stance) -> float:
+        """Return how far a stance is from the middle, page units."""
+        return float(np.linalg.norm(stance.position - self.middle))
+
     def capture_position(self, position: Array) -> Array:
         """Return a position of the page in the capture's coordinates."""
         return position / SCALE * self.space.unit + np.array(self.space.offset)
