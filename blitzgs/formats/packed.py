@@ -102,25 +102,30 @@ def _gsdata(model: Gaussians) -> Any:
 # --- compressed PLY: chunks of 256 Gaussians, as SuperSplat writes them ---
 
 
+def _layout(count: int, groups: int, degree: int) -> list[str]:
+    """Return the lines of a header but its comments; `groups`: of bounds that a chunk has, 2 or 3."""
+    bounds = [
+        f"{end}_{name}" for group in _BOUNDS[:groups] for end in ("min", "max") for name in group.split()
+    ]
+    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {-(-count // _CHUNK)}"]
+    lines += [f"property float {name}" for name in bounds]
+    lines += [f"element vertex {count}", *(f"property uint packed_{name}" for name in _WORDS)]
+    if degree > 0:
+        lines += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(_rest(degree)))]
+    return lines
+
+
 def write_compressed_ply(path: Path, source: GaussianSource) -> None:
     """Write a compressed PLY file block by block, with the header lines of the model."""
-    count, rest = len(source), _rest(source.degree)
-    chunks, first = -(-count // _CHUNK), 0
+    count, rest, first = len(source), _rest(source.degree), 0
+    chunks, lines = -(-count // _CHUNK), _layout(count, len(_BOUNDS), source.degree)
     with new_file(path) as partial, open(partial, "r+b") as file:
+        begin = file.write("\n".join([*lines[:2], *source.comments, *lines[2:], "end_header\n"]).encode())
         for block in unit_blocks(source):
             content: bytes = _gsply().compress_to_bytes(_gsdata(block))
-            header, _, body = content.partition(b"end_header\n")
-            if first == 0:
-                for element, of_all in (("chunk", chunks), ("vertex", count), ("sh", count)):
-                    header = re.sub(
-                        rf"element {element} \d+".encode(), f"element {element} {of_all}".encode(), header
-                    )
-                head, second, others = header.split(b"\n", 2)
-                lines = [line.encode() for line in source.comments]
-                begin = file.write(b"\n".join([head, second, *lines, others]) + b"end_header\n")
-            own = -(-len(block) // _CHUNK)
-            columns = [(first // _CHUNK, own, chunks, _CHUNK_BYTES), (first, len(block), count, 16)]
-            _write_columns(file, begin, body, [*columns, (first, len(block), count, rest)])
+            own = (first // _CHUNK, -(-len(block) // _CHUNK), chunks, _CHUNK_BYTES)
+            columns = [own, (first, len(block), count, 16), (first, len(block), count, rest)]
+            _write_columns(file, begin, content.partition(b"end_header\n")[2], columns)
             first += len(block)
 
 
@@ -164,14 +169,7 @@ def read_compressed_ply(path: Path) -> Gaussians:
             f"{path}: {chunks:,} chunks of {columns} numbers and {elements.get('sh', count):,} rows of SH do "
             f"not fit {count:,} Gaussians"
         )
-    groups = _BOUNDS[: columns // 6]
-    names = [f"{end}_{name}" for group in groups for end in ("min", "max") for name in group.split()]
-    expected = ["ply", "format binary_little_endian 1.0", f"element chunk {chunks}"]
-    expected += [f"property float {name}" for name in names]
-    expected += [f"element vertex {count}", *(f"property uint packed_{name}" for name in _WORDS)]
-    if rest:
-        expected += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(rest))]
-    if layout != expected:
+    if layout != _layout(count, columns // 6, degree):
         raise ValueError(f"{path}: the header is not that of a compressed PLY file, whose order is fixed")
     begin = len(header) + len(found)
     size = begin + chunks * columns * 4 + count * (16 + rest)
