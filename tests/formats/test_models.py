@@ -326,6 +326,7 @@ def damaged_spzs(path):
         "count larger than can be": (gz(spz_header(count=100_000), body), "cannot hold 100,000 Gaussians"),
         "fewer bytes": (gz(spz_header(count=11), body), "200|216 of 236|is cut off"),
         "bomb": (gz(spz_header(), bytes(30 << 20)), "inflates to more than"),
+        "bomb in a second part": (gz(spz_header(), body) + gz(bytes(30 << 20)), "inflates to more than"),
         "only a header": (b"NGSP" + bytes(4), "is cut off"),
     }
 
