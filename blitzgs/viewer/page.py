@@ -121,7 +121,7 @@ class Page:
         for visitor in [v for number, v in list(self.visitors.items()) if client_id in (None, number)]:
             visitor.stand_at(index)
 
-    def next_ask(self) -> tuple[Visitor, Ask] | None:
+    def next_ask(self) -> Ask | None:
         """Return the next picture that a visitor waits for; they take turns. None: there is none."""
         visitors = list(self.visitors.values())
         for shift in range(len(visitors)):
@@ -134,20 +134,20 @@ class Page:
                 continue
             if ask is not None:
                 self._turn += shift + 1
-                return visitor, ask
+                return ask
         return None
 
-    def deliver(self, visitor: Visitor, ask: Ask, picture: Picture) -> None:
-        """Send a picture to a visitor; drops it if two others have not been sent within a second."""
+    def deliver(self, ask: Ask, picture: Picture) -> None:
+        """Send a picture to its visitor; drops it if two others have not been sent within a second."""
         if not self._sending.acquire(timeout=_SEND_SECONDS):
             return
         try:
-            self._sender.submit(self._send, visitor, ask, picture)
+            self._sender.submit(self._send, ask, picture)
         except RuntimeError:  # the page is closed
             self._sending.release()
 
-    def _send(self, visitor: Visitor, ask: Ask, picture: Picture) -> None:
-        begin, busy = time.monotonic(), time.thread_time()
+    def _send(self, ask: Ask, picture: Picture) -> None:
+        visitor, begin, busy = ask.visitor, time.monotonic(), time.thread_time()
         try:
             shown = visitor.take(ask, picture)
             if shown is None or visitor.client.client_id not in self.visitors:

@@ -36,6 +36,7 @@ EYE_HEIGHT = 0.01
 class Ask:
     """A picture that a visitor waits for."""
 
+    visitor: Visitor
     look: Look  # what to draw
     version: int  # number of the visitor's viewpoint and choices
     scale: float  # side relative to full quality
@@ -227,7 +228,7 @@ class Visitor:
             fov = compare.fitting_fov(camera, width / height)
         K = intrinsics(width, height, fov)  # noqa: N806
         look = settings.look(self.world.viewmat(stance), K, width, height)
-        return Ask(look, version, scale, settings, index, columns, exposure)
+        return Ask(self, look, version, scale, settings, index, columns, exposure)
 
     def _sounding(self, stance: Stance, version: int, settings: Settings) -> Ask:
         """Return a look straight down, to find the ground under a visitor who walks."""
@@ -237,7 +238,8 @@ class Visitor:
         rotation = np.stack([side, np.cross(down, side), down], axis=1)
         pose = self.world.viewmat(Stance(stance.position, rotation, 0.2))
         plain = replace(settings, mode="depth", comparison="off", near=1e-6)
-        return Ask(plain.look(pose, intrinsics(32, 32, 0.2), 32, 32), version, 1.0, plain, is_sounding=True)
+        look = plain.look(pose, intrinsics(32, 32, 0.2), 32, 32)
+        return Ask(self, look, version, 1.0, plain, is_sounding=True)
 
     def take(self, ask: Ask, picture: Picture) -> Shown | None:
         """Note a drawn picture, and return what to show; None: nothing, or it is out of date."""

@@ -9,6 +9,7 @@ import socket
 import threading
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -67,7 +68,7 @@ def test_pictures_take_their_share_of_a_training(tmp_path):
     trainer = Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks())
     with contextlib.closing(live_page(trainer.state, 0, "127.0.0.1")) as live:
         assert not live.wants()  # nobody looks
-        live._last = (None, None)
+        live._last = SimpleNamespace()
         live.page.deliver = lambda *_: None
         before = time.monotonic()
         live.show(None, 0.3)
