@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from blitzgs.formats import packed
 from blitzgs.formats.gaussians import MIP, Gaussians
 from blitzgs.formats.models import FORMATS, check_replaces, read_gaussians, with_degree
+from blitzgs.runs.world import rotated_harmonics
 from tests.helpers import refused, some_gaussians
 
 gaussforge = pytest.importorskip("gaussforge")
@@ -69,33 +70,15 @@ def splat_by_hand(path):
 
 
 def turned(model):
-    """Half a turn about x, by rotating colours: SH are fitted to the colours of the turned directions."""
+    """Half a turn about x."""
     half = Rotation.from_quat([1, 0, 0, 0])
     quats = (half * Rotation.from_quat(np.roll(model.quats.numpy(), -1, axis=1))).as_quat()
-    directions = np.random.default_rng(0).normal(size=(400, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    k = model.sh.shape[1]
-    before, after = basis(half.inv().apply(directions))[:, :k], basis(directions)[:, :k]
-    mixed = np.linalg.lstsq(after, before, rcond=None)[0]
     return replace(
         model,
         means=torch.from_numpy(half.apply(model.means.numpy())).float(),
         quats=torch.from_numpy(np.roll(quats, 1, axis=1)).float(),
-        sh=torch.from_numpy(np.einsum("jk,nkc->njc", mixed, model.sh.numpy())).float(),
+        sh=rotated_harmonics(model.sh, torch.from_numpy(half.as_matrix())),
     )
-
-
-def basis(d):
-    """The real harmonics of degrees 0 to 3 up to positive factors, which a half turn does not mix."""
-    x, y, z = d.T
-    return np.stack(
-        [
-            np.ones_like(x), -y, z, -x, x * y, -y * z, 3 * z * z - 1, -x * z, x * x - y * y,
-            -y * (3 * x * x - y * y), x * y * z, -y * (5 * z * z - 1), z * (5 * z * z - 3),
-            -x * (5 * z * z - 1), z * (x * x - y * y), -x * (x * x - 3 * y * y),
-        ],
-        axis=1,
-    )  # fmt: skip
 
 
 def compare(found, model, bounds):

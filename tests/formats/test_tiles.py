@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from blitzgs.formats import gaussians as blocks
 from blitzgs.formats.gaussians import MIP, Gaussians
@@ -59,15 +60,9 @@ def corners(volume):
 def ellipsoid_corners(attributes):
     """Return the box of the ellipsoids at 3 standard deviations, from what a file holds."""
     quats, scales = (attributes[f"KHR_gaussian_splatting:{name}"] for name in ("ROTATION", "SCALE"))
-    low, high = [], []
-    for mean, (x, y, z, w), scale in zip(attributes["POSITION"], quats.astype(float), scales, strict=True):
-        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        covariance = np.eye(3) + 2 * w * cross + 2 * cross @ cross
-        covariance = covariance @ np.diag(scale.astype(float) ** 2) @ covariance.T
-        reach = 3 * np.sqrt(np.diag(covariance))
-        low.append(mean - reach)
-        high.append(mean + reach)
-    return np.min(low, axis=0), np.max(high, axis=0)
+    axes = Rotation.from_quat(quats).as_matrix() * scales[:, None]
+    reach = 3 * np.linalg.norm(axes, axis=2)
+    return (attributes["POSITION"] - reach).min(axis=0), (attributes["POSITION"] + reach).max(axis=0)
 
 
 @pytest.fixture(scope="module")
