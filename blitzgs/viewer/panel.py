@@ -18,7 +18,7 @@ from blitzgs.view.draw import LEVEL_COLOURS
 from blitzgs.view.look import MODES
 from blitzgs.viewer import compare
 from blitzgs.viewer.frustums import Frustums
-from blitzgs.viewer.paths import Route, note, safe_name, save_beside
+from blitzgs.viewer.paths import Route
 from blitzgs.viewer.settings import Triple
 from blitzgs.viewer.visitor import Shown, Visitor
 from blitzgs.viewer.world import SCALE
@@ -189,9 +189,7 @@ class Panel:
         if shown is None:
             return
         content = encode_image(torch.from_numpy(shown.image), ".png")
-        name = f"{safe_name(self._exhibit.title)}_{time.strftime('%Y%m%d_%H%M%S')}.png"
-        visitor.client.send_file_download(name, content, save_immediately=True)
-        note(visitor, save_beside(self._exhibit.paths, name, content))
+        visitor.save(f"{self._exhibit.title}_{time.strftime('%Y%m%d_%H%M%S')}", ".png", content)
 
 
 _BOX = (

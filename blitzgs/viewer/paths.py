@@ -9,17 +9,14 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import time
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from blitzgs.util.output import write_file
 from blitzgs.viewer.world import Stance
 
 if TYPE_CHECKING:
@@ -244,7 +241,7 @@ class Route:
     def _timed(self) -> CameraPath | None:
         """Return the path as the controls say; without viewpoints, tell the visitor, and return None."""
         if not self._path.keyframes:
-            note(self._visitor, "add a viewpoint first")
+            self._visitor.note("add a viewpoint first")
             return None
         self._path.seconds, self._path.is_cycle = float(self._seconds.value), bool(self._cycle.value)
         return self._path
@@ -265,39 +262,16 @@ class Route:
         self._plays = False
 
     def _save(self) -> None:
-        """Write the path beside the run, and give it to the browser."""
         if (path := self._timed()) is not None:
-            text, name = to_json(path), safe_name(self._name.value) + ".json"
-            self._visitor.client.send_file_download(name, text.encode(), save_immediately=True)
-            note(self._visitor, save_beside(self._visitor.exhibit.paths, name, text))
+            self._visitor.save(self._name.value, ".json", to_json(path).encode())
 
     def _load(self, content: bytes) -> None:
         """Take over a path from a file, and go to its first viewpoint."""
         try:
             self._path = replace(from_json(content.decode()), played=[])
         except ValueError as error:
-            note(self._visitor, str(error))
+            self._visitor.note(str(error))
             return
         self._seconds.value, self._cycle.value = self._path.seconds, self._path.is_cycle
         self._tell()
         self._go(self._path.keyframes[0])
-
-
-def save_beside(folder: Path, name: str, content: bytes | str) -> str:
-    """Write a file into the folder for paths and screenshots; return what to tell the visitor."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_file(folder / name, content)
-    except OSError as error:
-        return f"the file is in the browser's downloads; {folder} cannot be written: {error}"
-    return f"saved as {folder / name}"
-
-
-def note(visitor: Visitor, text: str) -> None:
-    """Show a note on the visitor's page for some seconds."""
-    visitor.client.add_notification("BlitzGS", text, auto_close_seconds=6.0)
-
-
-def safe_name(text: str) -> str:
-    """Return a text as the name of a file."""
-    return re.sub(r"[^\w.-]+", "_", text).strip("._") or "view"

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -14,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from blitzgs.util.output import write_file
 from blitzgs.util.rotations import quaternion_matrices
 from blitzgs.view.draw import intrinsics
 from blitzgs.view.look import Look, Picture
@@ -154,7 +156,7 @@ class Visitor:
         with self.client.atomic():
             camera.up_direction = self.world.up if up is None else up
             camera.position = stance.position
-            camera.look_at = stance.position + stance.forward * distance
+            camera.look_at = stance.position + stance.rotation[:, 2] * distance
             camera.fov = stance.fov
 
     def stand_at(self, index: int) -> None:
@@ -282,3 +284,20 @@ class Visitor:
         with self._lock:
             self._drawn, self._drawn_scale = max(ask.version, self._drawn), 1.0
         self.client.add_notification("BlitzGS", reason, auto_close_seconds=10.0, color="red")
+
+    def note(self, text: str) -> None:
+        """Show a note on the page for some seconds."""
+        self.client.add_notification("BlitzGS", text, auto_close_seconds=6.0)
+
+    def save(self, name: str, suffix: str, content: bytes) -> None:
+        """Give a file to the browser, write it into the folder for paths and screenshots, and say so."""
+        name = (re.sub(r"[^\w.-]+", "_", name).strip("._") or "view") + suffix
+        self.client.send_file_download(name, content, save_immediately=True)
+        folder = self.exhibit.paths
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_file(folder / name, content)
+        except OSError as error:
+            self.note(f"the file is in the browser's downloads; {folder} cannot be written: {error}")
+        else:
+            self.note(f"saved as {folder / name}")

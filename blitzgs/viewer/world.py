@@ -30,11 +30,6 @@ class Stance:
     rotation: Array  # camera to world, [3, 3]; the axes are right, down and forward
     fov: float  # radians
 
-    @property
-    def forward(self) -> Array:
-        """The direction of view."""
-        return self.rotation[:, 2]
-
     def is_near(self, other: Stance, distance: float = 1e-3, angle: float = 0.005) -> bool:
         """Tell whether another stance differs by less than a distance (page units) and an angle (radians)."""
         cosine = (np.trace(self.rotation.T @ other.rotation) - 1) / 2
