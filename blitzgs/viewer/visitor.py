@@ -22,7 +22,7 @@ from blitzgs.view.look import Look, Picture
 from blitzgs.viewer import compare
 from blitzgs.viewer.compare import Shaded, shaded
 from blitzgs.viewer.settings import STILL_SECONDS, Pace, Settings
-from blitzgs.viewer.world import SCALE, Exhibit, Stance, World
+from blitzgs.viewer.world import SCALE, Exhibit, Stance, World, horizontal, looking
 
 if TYPE_CHECKING:
     import viser
@@ -234,13 +234,10 @@ class Visitor:
 
     def _sounding(self, stance: Stance, version: int, settings: Settings) -> Ask:
         """Return a look straight down, to find the ground under a visitor who walks."""
-        down = -self.world.up
-        side = stance.rotation[:, 0] - self.world.up * float(stance.rotation[:, 0] @ self.world.up)
-        side = side / max(1e-9, float(np.linalg.norm(side)))
-        rotation = np.stack([side, np.cross(down, side), down], axis=1)
-        pose = self.world.viewmat(Stance(stance.position, rotation, 0.2))
+        up = self.world.up
+        down = looking(stance.position, stance.position - up, horizontal(up)[0], 0.2)
         plain = replace(settings, mode="depth", comparison="off", near=1e-6)
-        look = plain.look(pose, intrinsics(32, 32, 0.2), 32, 32)
+        look = plain.look(self.world.viewmat(down), intrinsics(32, 32, down.fov), 32, 32)
         return Ask(self, look, version, 1.0, plain, is_sounding=True)
 
     def take(self, ask: Ask, picture: Picture) -> Shown | None:
