@@ -21,9 +21,11 @@ from blitzgs.cli.view import photographs
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.folder import open_run
 from blitzgs.training.trainer import Trainer
+from blitzgs.view.draw import Drawer
 from blitzgs.viewer.paths import from_json
 from blitzgs.viewer.studio import Studio, open_model
-from blitzgs.viewer.world import SCALE
+from blitzgs.viewer.visitor import EYE_HEIGHT
+from blitzgs.viewer.world import SCALE, looking
 from tests.browser import Browser, needs_chromium, wait_for
 from tests.helpers import export_ply
 from tests.training.tiny import tiny_config, tiny_scene
@@ -206,6 +208,17 @@ def test_walking_is_at_eye_height(studio, browser):
     browser.press("walk")
     wait_for(lambda: visitor.motion == "walk", 60, "the motion is chosen")
     settled(studio)
+    visitor.go(looking(visitor.world.middle + visitor.world.up, visitor.world.middle, visitor.world.up, 0.9))
+
+    def height():
+        down = visitor._sounding(visitor.stance, visitor.version, visitor.settings)
+        depth = drawer.draw(down.look).values
+        known = depth[depth > 0]
+        return np.median(known) / visitor.exhibit.space.unit if len(known) else math.inf
+
+    drawer = Drawer(studio._drawer._subject, studio._drawer._owners)  # its own draws at the same time
+    wanted = EYE_HEIGHT * visitor.exhibit.space.extent
+    wait_for(lambda: height() == pytest.approx(wanted, rel=0.2), 60, "the visitor stands on the ground")
     browser.press("orbit")
     wait_for(lambda: visitor.motion == "orbit", 60, "the motion is chosen")
     settled(studio)
