@@ -62,7 +62,10 @@ def orbit(opened: Opened) -> tuple[list[float], float, float]:
 
 def drawn_alone(opened: Opened, size: tuple[int, int], seconds: float) -> dict[str, float]:
     """Draw the client's orbit without a server."""
-    drawer, world = Drawer(opened.subject, TileOwners(opened.ranks)), World(opened.exhibit.space, [])
+    drawer, world = (
+        Drawer(opened.subject, TileOwners(opened.ranks)),
+        World(opened.exhibit.space, [], opened.exhibit.box),
+    )
     middle, radius, height = orbit(opened)
     times, begin = [], time.monotonic()
     while (now := time.monotonic()) < begin + WARM_UP + seconds:

@@ -150,9 +150,9 @@ def check_memory(holds: str, count: int, degree: int, copies: int = 2) -> None:
 
 def joined(parts: list[Gaussians]) -> Gaussians:
     """Return parts of a model, at least one, as one; normals are left out."""
-    columns: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts]) for name in _COLUMNS}
-    levels = [part.levels for part in parts if part.levels is not None]
-    return replace(parts[0], normals=None, levels=torch.cat(levels) if levels else None, **columns)
+    names = parts[0]._columns().keys() - {"normals"}
+    columns: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+    return replace(parts[0], normals=None, **columns)
 
 
 def is_antialiased(source: GaussianSource) -> bool:

@@ -79,21 +79,18 @@ def write_glb(path: Path, source: GaussianSource, up: tuple[float, float, float]
     room += -room % 4
     box = np.array([[np.inf] * 3, [-np.inf] * 3])
     with new_file(path) as partial, open(partial, "r+b") as file:
-        start, body = 0, 20 + room + 8
+        start, body = 0, 28 + room
         for block in source.blocks():
             block.check()
             box = around([box, torch.stack(block.means.aminmax(dim=0)).double().numpy()])
-            for column, values in zip(columns, _values(block, path), strict=True):
+            for column, values in zip(columns, _values(block).values(), strict=True):
                 file.seek(body + column.offset + column.width * start)
                 file.write(np.ascontiguousarray(values).data)
             start += len(block)
         if start != count:
             raise ValueError(f"{path}: {count:,} Gaussians were announced, {start:,} came")
-        text = _json(source, columns, size, box, up).ljust(room)
         file.seek(0)
-        file.write(struct.pack("<4sIIII", b"glTF", 2, body + size, room, 0x4E4F534A))
-        file.write(text)
-        file.write(struct.pack("<II", size, 0x004E4942))
+        file.write(_head(_json(source, columns, size, box, up).ljust(room), size))
 
 
 def write_spz_glb(path: Path, model: Gaussians) -> None:
@@ -113,47 +110,46 @@ def write_spz_glb(path: Path, model: Gaussians) -> None:
     text = _json(model, columns, len(data), box, None)
     text, data = text.ljust(-(-len(text) // 4) * 4), data.ljust(-(-len(data) // 4) * 4, b"\0")
     with new_file(path) as partial:
-        head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(data), len(text), 0x4E4F534A)
-        partial.write_bytes(head + text + struct.pack("<II", len(data), 0x004E4942) + data)
+        partial.write_bytes(_head(text, len(data)) + data)
+
+
+def _head(text: bytes, size: int) -> bytes:
+    """Return what a GLB file has before its binary chunk of so many bytes; `text` is the JSON."""
+    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + size, len(text), 0x4E4F534A)
+    return head + text + struct.pack("<II", size, 0x004E4942)
 
 
 def _columns(count: int, degree: int, has_levels: bool) -> list[_Column]:
-    kinds = [("POSITION", "VEC3", _FLOAT, 12), (f"{_PREFIX}ROTATION", "VEC4", _FLOAT, 16)]
-    kinds += [(f"{_PREFIX}SCALE", "VEC3", _FLOAT, 12), (f"{_PREFIX}OPACITY", "SCALAR", _FLOAT, 4)]
-    kinds += [("COLOR_0", "VEC4", _BYTE, 4)]
-    kinds += [
-        (f"{_PREFIX}SH_DEGREE_{d}_COEF_{n}", "VEC3", _FLOAT, 12)
-        for d in range(degree + 1)
-        for n in range(2 * d + 1)
-    ]
-    if has_levels:
-        kinds.append(("_LEVEL", "SCALAR", _FLOAT, 4))
+    none, k = torch.empty(0), (degree + 1) ** 2
+    empty = Gaussians(
+        none.view(0, 3), none.view(0, 4), none.view(0, 3), none, torch.empty(0, k, 3),
+        levels=none if has_levels else None,
+    )  # fmt: skip
     columns, offset = [], 0
-    for name, type_, component, width in kinds:
-        columns.append(_Column(name, type_, component, offset, width))
-        offset += width * count
+    for name, values in _values(empty).items():
+        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]]
+        component = _BYTE if values.dtype == np.uint8 else _FLOAT
+        columns.append(_Column(name, kind, component, offset, values.itemsize * values.shape[1]))
+        offset += columns[-1].width * count
     return columns
 
 
-def _values(block: Gaussians, path: Path) -> list[Array]:
-    """Return the columns of a block in the order of `_columns`."""
-    opacities = block.opacities.double().sigmoid().numpy()
-    scales = block.scales.exp().numpy()
-    sh = block.sh.numpy()
-    for name, values in (("scales", scales), ("sh", sh)):
-        if not np.isfinite(values).all():
-            raise ValueError(f"{path}: {name} are not finite in float32, which glTF requires")
-    colors = np.concatenate([0.5 + SH_C0 * sh[:, 0], opacities[:, None]], axis=1)
-    columns: list[Array] = [
-        block.means.numpy(),
-        unit_quats(block.quats)[:, [1, 2, 3, 0]].float().numpy(),
-        scales,
-        opacities.astype(np.float32),
-        np.rint(colors.clip(0, 1) * 255).astype(np.uint8),
-        *(sh[:, k] for k in range(sh.shape[1])),
-    ]
+def _values(block: Gaussians) -> dict[str, Array]:
+    """Return the columns of a block in the order of the file, float32 or uint8 [N, C]."""
+    opacities = block.opacities[:, None].double().sigmoid().numpy()
+    colors = np.concatenate([0.5 + SH_C0 * block.sh[:, 0].numpy(), opacities], axis=1)
+    columns: dict[str, Array] = {
+        "POSITION": block.means.numpy(),
+        f"{_PREFIX}ROTATION": unit_quats(block.quats)[:, [1, 2, 3, 0]].float().numpy(),
+        f"{_PREFIX}SCALE": block.scales.exp().numpy(),
+        f"{_PREFIX}OPACITY": opacities.astype(np.float32),
+        "COLOR_0": np.rint(colors.clip(0, 1) * 255).astype(np.uint8),
+    }
+    for d in range(block.degree + 1):
+        for n in range(2 * d + 1):
+            columns[f"{_PREFIX}SH_DEGREE_{d}_COEF_{n}"] = block.sh[:, d * d + n].numpy()
     if block.levels is not None:
-        columns.append(block.levels.float().numpy())
+        columns["_LEVEL"] = block.levels[:, None].float().numpy()
     return columns
 
 
@@ -207,14 +203,9 @@ def _json(
             {"buffer": 0, "byteOffset": c.offset, "byteLength": c.width * count, "target": 34962}
             for c in columns
         ]
-        content["nodes"] = [{"mesh": 0, "rotation": _rotation_to_y(up)}]
+        w, x, y, z = quaternions(torch.from_numpy(shortest_turn(up, 1))[None])[0].tolist()
+        content["nodes"] = [{"mesh": 0, "rotation": [x, y, z, w]}]
     return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
-
-
-def _rotation_to_y(up: tuple[float, float, float]) -> list[float]:
-    """Return the shortest rotation from `up` to +Y as x, y, z, w; half a turn about x from -Y."""
-    w, x, y, z = quaternions(torch.from_numpy(shortest_turn(up, 1))[None])[0].tolist()
-    return [x, y, z, w]
 
 
 def shortest_turn(direction: tuple[float, float, float], axis: int) -> npt.NDArray[np.float64]:

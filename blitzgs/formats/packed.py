@@ -102,25 +102,30 @@ def _gsdata(model: Gaussians) -> Any:
 # --- compressed PLY: chunks of 256 Gaussians, as SuperSplat writes them ---
 
 
+def _layout(count: int, groups: int, degree: int) -> list[str]:
+    """Return the lines of a header but its comments; `groups`: of bounds that a chunk has, 2 or 3."""
+    bounds = [
+        f"{end}_{name}" for group in _BOUNDS[:groups] for end in ("min", "max") for name in group.split()
+    ]
+    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {-(-count // _CHUNK)}"]
+    lines += [f"property float {name}" for name in bounds]
+    lines += [f"element vertex {count}", *(f"property uint packed_{name}" for name in _WORDS)]
+    if degree > 0:
+        lines += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(_rest(degree)))]
+    return lines
+
+
 def write_compressed_ply(path: Path, source: GaussianSource) -> None:
     """Write a compressed PLY file block by block, with the header lines of the model."""
-    count, rest = len(source), _rest(source.degree)
-    chunks, first = -(-count // _CHUNK), 0
+    count, rest, first = len(source), _rest(source.degree), 0
+    chunks, lines = -(-count // _CHUNK), _layout(count, len(_BOUNDS), source.degree)
     with new_file(path) as partial, open(partial, "r+b") as file:
+        begin = file.write("\n".join([*lines[:2], *source.comments, *lines[2:], "end_header\n"]).encode())
         for block in unit_blocks(source):
             content: bytes = _gsply().compress_to_bytes(_gsdata(block))
-            header, _, body = content.partition(b"end_header\n")
-            if first == 0:
-                for element, of_all in (("chunk", chunks), ("vertex", count), ("sh", count)):
-                    header = re.sub(
-                        rf"element {element} \d+".encode(), f"element {element} {of_all}".encode(), header
-                    )
-                head, second, others = header.split(b"\n", 2)
-                lines = [line.encode() for line in source.comments]
-                begin = file.write(b"\n".join([head, second, *lines, others]) + b"end_header\n")
-            own = -(-len(block) // _CHUNK)
-            columns = [(first // _CHUNK, own, chunks, _CHUNK_BYTES), (first, len(block), count, 16)]
-            _write_columns(file, begin, body, [*columns, (first, len(block), count, rest)])
+            own = (first // _CHUNK, -(-len(block) // _CHUNK), chunks, _CHUNK_BYTES)
+            columns = [own, (first, len(block), count, 16), (first, len(block), count, rest)]
+            _write_columns(file, begin, content.partition(b"end_header\n")[2], columns)
             first += len(block)
 
 
@@ -164,14 +169,7 @@ def read_compressed_ply(path: Path) -> Gaussians:
             f"{path}: {chunks:,} chunks of {columns} numbers and {elements.get('sh', count):,} rows of SH do "
             f"not fit {count:,} Gaussians"
         )
-    groups = _BOUNDS[: columns // 6]
-    names = [f"{end}_{name}" for group in groups for end in ("min", "max") for name in group.split()]
-    expected = ["ply", "format binary_little_endian 1.0", f"element chunk {chunks}"]
-    expected += [f"property float {name}" for name in names]
-    expected += [f"element vertex {count}", *(f"property uint packed_{name}" for name in _WORDS)]
-    if rest:
-        expected += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(rest))]
-    if layout != expected:
+    if layout != _layout(count, columns // 6, degree):
         raise ValueError(f"{path}: the header is not that of a compressed PLY file, whose order is fixed")
     begin = len(header) + len(found)
     size = begin + chunks * columns * 4 + count * (16 + rest)
@@ -292,7 +290,7 @@ def write_spz(path: Path, source: GaussianSource) -> None:
     with new_file(path) as partial, tempfile.TemporaryFile(dir=path.parent) as file:
         for block in unit_blocks(source):
             _gsply().write_spz(partial, _gsdata(_half_turn(block)), fractional_bits=bits)
-            content = zlib.decompress(partial.read_bytes(), wbits=31)
+            content = gzip.decompress(partial.read_bytes())
             if first == 0:
                 flags = content[14] | (_SPZ_ANTIALIASED if is_antialiased(source) else 0)
                 file.write(content[:8] + struct.pack("<I", count) + content[12:14] + bytes([flags, 0]))
@@ -310,7 +308,7 @@ def read_spz(path: Path) -> Gaussians:
         start = file.read(32)
     deflated = not start.startswith(b"NGSP")
     if deflated:
-        start = _inflated(path, 16, None)
+        start, _ = _inflated(path, 0)
     if len(start) < 16:
         raise ValueError(f"{path} is cut off: it has no whole header")
     magic, version, count, degree, _, flags = struct.unpack_from("<IIIBBB", start)
@@ -323,7 +321,11 @@ def read_spz(path: Path) -> Gaussians:
     if deflated:
         if size > _DEFLATE * path.stat().st_size:
             raise ValueError(f"{path}: {path.stat().st_size:,} bytes cannot hold {count:,} Gaussians")
-        _inflated(path, size, _SPZ_EXTENSIONS)
+        _, total = _inflated(path, size + _SPZ_EXTENSIONS)
+        if total > size + _SPZ_EXTENSIONS:
+            raise ValueError(f"{path} is damaged: it inflates to more than the {size:,} bytes it names")
+        if total < size:
+            raise ValueError(f"{path} is cut off: {total:,} of {size:,} bytes")
     try:
         found = _gsply().read_spz(path)
     except Exception as error:  # the package raises what its parts raise
@@ -345,25 +347,18 @@ def read_spz(path: Path) -> Gaussians:
     )
 
 
-def _inflated(path: Path, size: int, more: int | None) -> bytes:
-    """Return the first bytes of a deflated file; with `more`, check that it has `size` and so many more."""
-    inflate, start, total = zlib.decompressobj(31), b"", 0
+def _inflated(path: Path, most: int) -> tuple[bytes, int]:
+    """Return the first 16 bytes of a deflated file, and its length, counted until it is above `most`."""
+    start, total = b"", 0
     try:
-        with open(path, "rb") as file:
-            while not inflate.eof and (data := inflate.unconsumed_tail or file.read(1 << 20)):
-                part = inflate.decompress(data, 1 << 20)
-                start, total = start + part[: 16 - len(start)], total + len(part)
-                if more is None and len(start) == 16:
-                    return start
-                if more is not None and total > size + more:
-                    raise ValueError(
-                        f"{path} is damaged: it inflates to more than the {size:,} bytes it names"
-                    )
-    except zlib.error as error:
+        with gzip.open(path) as file:
+            while total <= most and (part := file.read(1 << 20)):
+                start, total = start or part[:16], total + len(part)
+    except EOFError as error:
+        raise ValueError(f"{path} is cut off: {error}") from error
+    except (gzip.BadGzipFile, zlib.error) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
-    if more is not None and (total < size or not inflate.eof):
-        raise ValueError(f"{path} is cut off: {total:,} of {size:,} bytes")
-    return start
+    return start, total
 
 
 def _half_turn(model: Gaussians) -> Gaussians:

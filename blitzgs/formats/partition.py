@@ -13,14 +13,14 @@ import errno
 import math
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from blitzgs.formats.gaussians import Gaussians, GaussianSource, unit_quats
+from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased, unit_quats
 from blitzgs.util.rotations import quaternion_matrices
 from blitzgs.util.terminal import amount
 
@@ -67,10 +67,10 @@ class Partition:
     def _choose_grid(self) -> None:
         step = max(1, -(-len(self._source) // _SAMPLE))
         means = np.concatenate([chunk[::step] for chunk in self._chunks()]).astype(np.float64)
-        self.box = np.quantile(means, [0.002, 0.998], axis=0)
-        self.side = 1.05 * float(np.ptp(self.box, axis=0).max()) or 1.0
+        self._box = np.quantile(means, [0.002, 0.998], axis=0)
+        self._side = 1.05 * float(np.ptp(self._box, axis=0).max()) or 1.0
         # A flat scene is not cut along its short side.
-        self._origin, self._cell = self.box[0] - 0.02 * self.side, self.side / 2**BITS
+        self._origin, self._cell = self._box[0] - 0.02 * self._side, self._side / 2**BITS
 
     def _chunks(self) -> Iterator[_Places]:
         with open(self._places, "rb") as file:
@@ -83,15 +83,12 @@ class Partition:
         return interleaved(index, BITS)
 
     def _count(self) -> None:
-        codes, counts = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        # Keys of the occupied cells, sorted, and the number of Gaussians in each, int64 [E].
+        self.cells = self.counts = np.zeros(0, np.int64)
         for chunk in self._chunks():
             new, times = np.unique(self._codes(chunk), return_counts=True)
-            codes, inverse = np.unique(np.concatenate([codes, new]), return_inverse=True)
-            merged = np.zeros(len(codes), np.int64)
-            np.add.at(merged, inverse, np.concatenate([counts, times]))
-            counts = merged
-        # Keys of the occupied cells, sorted, and the number of Gaussians in each, int64 [E].
-        self.cells, self.counts = codes, counts
+            self.cells, place = np.unique(np.concatenate([self.cells, new]), return_inverse=True)
+            self.counts = np.bincount(place, np.concatenate([self.counts, times])).astype(np.int64)
 
     def place(self, parts: Ints) -> Parts:
         """Read the model again and sort its rows.
@@ -103,11 +100,9 @@ class Partition:
         with open(self._rows, "wb") as file:
             for block in self._source.blocks():
                 found = parts[np.searchsorted(self.cells, self._codes(block.means.numpy()))]
-                rows = np.empty((len(block), self._width), "<f4")
-                rows[:, 0:3], rows[:, 3:7] = block.means.numpy(), block.quats.numpy()
-                rows[:, 7:10], rows[:, 10] = block.scales.numpy(), block.opacities.numpy()
-                rows[:, 11] = 0 if block.levels is None else block.levels.numpy()
-                rows[:, 12:] = block.sh.reshape(len(block), -1).numpy()
+                levels = torch.zeros(len(block)) if block.levels is None else block.levels
+                columns = [block.means, block.quats, block.scales, block.opacities[:, None], levels[:, None]]
+                rows = torch.cat([*columns, block.sh.flatten(1)], dim=1).numpy()
                 by_part = np.argsort(found, kind="stable")
                 present, firsts = np.unique(found[by_part], return_index=True)
                 for one, some in zip(present, np.split(by_part, firsts[1:]), strict=True):
@@ -117,7 +112,8 @@ class Partition:
         if (position != starts[1:]).any():
             raise ValueError("the model changed between its two readings: write it when no training does")
         self._places.unlink()
-        return Parts(self._rows, self._width, self._source.comments, self._source.has_levels, starts)
+        known = (self._source.comments, self._source.has_levels, is_antialiased(self._source))
+        return Parts(self._rows, self._width, *known, self._box, self._side, starts)
 
 
 @dataclass(frozen=True)
@@ -128,20 +124,20 @@ class Parts:
     width: int  # numbers of a row
     comments: list[str]  # header lines of the model
     has_levels: bool  # whether the model has trained levels
+    antialiased: bool  # whether viewers compensate the screen-space blur
+    box: Array  # where nearly all of the model is, [2, 3]
+    side: float  # of the grid
     starts: Ints  # first row of each part, and the number of rows, int64 [P + 1]
 
     def read(self, part: int) -> Gaussians:
         """Read the Gaussians of a part."""
         begin, end = int(self.starts[part]), int(self.starts[part + 1])
-        values = np.fromfile(
-            self.file, "<f4", (end - begin) * self.width, offset=4 * self.width * begin
-        ).reshape(-1, self.width)
-        rows = torch.from_numpy(values)
-        return Gaussians(
-            means=rows[:, 0:3], quats=rows[:, 3:7], scales=rows[:, 7:10], opacities=rows[:, 10],
-            sh=rows[:, 12:].reshape(len(rows), -1, 3), comments=self.comments,
-            levels=rows[:, 11] if self.has_levels else None,
-        )  # fmt: skip
+        count = (end - begin) * self.width
+        rows = torch.from_numpy(np.fromfile(self.file, "<f4", count, offset=4 * self.width * begin))
+        columns = rows.view(-1, self.width).split([3, 4, 3, 1, 1, self.width - 12], dim=1)
+        means, quats, scales, opacities, levels, sh = columns
+        found = Gaussians(means, quats, scales, opacities[:, 0], sh.unflatten(1, (-1, 3)))
+        return replace(found, comments=self.comments, levels=levels[:, 0] if self.has_levels else None)
 
 
 def interleaved(index: Ints, bits: int) -> Ints:

@@ -51,7 +51,7 @@ class PlySource:
         ValueError: see `read_ply`.
         """
         self._path, self._checked = path, checked
-        found, self._count = self._read(0, 0)
+        found, self._count = _read(path, 0, 0)
         self.comments, self.degree, self.has_levels = found.comments, found.degree, found.has_levels
 
     def __len__(self) -> int:
@@ -60,7 +60,7 @@ class PlySource:
     def blocks(self) -> Iterator[Gaussians]:
         """Yield all Gaussians in order (ValueError: a value cannot be shown; names the file)."""
         for first in range(0, self._count, BLOCK):
-            block, _ = self._read(first, BLOCK)
+            block, _ = _read(self._path, first, BLOCK)
             try:
                 if self._checked:
                     block.check()
@@ -69,21 +69,18 @@ class PlySource:
                 raise ValueError(f"{self._path}, from Gaussian {first:,} on: {error}, {remedy}") from error
             yield block
 
-    def _read(self, first: int, most: int) -> tuple[Gaussians, int]:
-        comments, table, total = _read_table(self._path, first, most)
-        return _gaussians(self._path, comments, table), total
-
 
 def read_ply(path: Path | str) -> Gaussians:
     """Read Gaussians; properties may come in any order, and normals may be missing.
 
     ValueError: the file is damaged or has no such Gaussians; names the file and the reason.
     """
-    comments, table, _ = _read_table(Path(path))
-    return _gaussians(Path(path), comments, table)
+    return _read(Path(path))[0]
 
 
-def _gaussians(path: Path, comments: list[str], table: npt.NDArray[np.void]) -> Gaussians:
+def _read(path: Path, *rows: int) -> tuple[Gaussians, int]:
+    """Return Gaussians of a file, and the number of all; `rows` as for `_read_table`."""
+    comments, table, total = _read_table(path, *rows)
     names = table.dtype.names or ()
     rest = sum(name.startswith("f_rest_") for name in names)
     k = (degree_of(rest, path) + 1) ** 2
@@ -102,7 +99,7 @@ def _gaussians(path: Path, comments: list[str], table: npt.NDArray[np.void]) -> 
     sh[:, 0] = columns("f_dc_0", "f_dc_1", "f_dc_2")
     for channel in range(3):
         sh[:, 1:, channel] = columns(*(f"f_rest_{channel * (k - 1) + i}" for i in range(k - 1)))
-    return Gaussians(
+    found = Gaussians(
         means=columns("x", "y", "z"),
         quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
         scales=columns("scale_0", "scale_1", "scale_2"),
@@ -112,6 +109,7 @@ def _gaussians(path: Path, comments: list[str], table: npt.NDArray[np.void]) -> 
         comments=comments,
         levels=columns(LEVEL)[:, 0] if LEVEL in names else None,
     )
+    return found, total
 
 
 def write_ply(
@@ -155,7 +153,9 @@ def write_ply(
 
 def save_ply(path: Path, source: GaussianSource, offset: npt.NDArray[np.float64] | None = None) -> None:
     """Write Gaussians block by block; see `write_ply`."""
-    check_replaces_ply(path)
+    check_replaceable(path, (b"ply",), " and is not a PLY file")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path.parent} is not a folder: make it first, or choose another one")
     names = _property_names((source.degree + 1) ** 2) + [LEVEL] * source.has_levels
     for line in source.comments:
         if not line.startswith(("comment", "obj_info")) or "\n" in line:
@@ -168,40 +168,22 @@ def save_ply(path: Path, source: GaussianSource, offset: npt.NDArray[np.float64]
                 file.write(os.fsencode("\n".join(header)))
                 for block in source.blocks():
                     block.check()
-                    file.write(_rows(block, len(names), offset).data)
+                    file.write(_rows(block, offset).data)
         except OSError as error:
             reason = error.strerror or str(error).rpartition(": ")[2]
             raise OSError(f"{path} cannot be written: {reason}") from error
 
 
-def _rows(block: Gaussians, width: int, offset: npt.NDArray[np.float64] | None) -> npt.NDArray[np.float32]:
-    """Return the bytes of a block, float32 [N, width]."""
-    n, rest = len(block), 3 * (block.sh.shape[1] - 1)
-    rows = np.zeros((n, width), dtype="<f4")
-    means = block.means.detach().cpu().double().numpy()
-    rows[:, 0:3] = means if offset is None else means + np.asarray(offset)
-    if block.normals is not None:
-        rows[:, 3:6] = _array(block.normals)
-    coefficients, end = _array(block.sh), 17 + rest
-    rows[:, 6:9] = coefficients[:, 0]
-    rows[:, 9 : 9 + rest] = coefficients[:, 1:].transpose(0, 2, 1).reshape(n, rest)
-    rows[:, end - 8] = _array(block.opacities)
-    rows[:, end - 7 : end - 4] = _array(block.scales)
-    rows[:, end - 4 : end] = _array(block.quats)
+def _rows(block: Gaussians, offset: npt.NDArray[np.float64] | None) -> npt.NDArray[np.float32]:
+    """Return the bytes of a block, float32 [N, properties]."""
+    means, sh = block.means.detach().cpu().double().numpy(), _array(block.sh)
+    normals = np.zeros_like(means) if block.normals is None else _array(block.normals)
+    rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(block), 3 * (sh.shape[1] - 1))
+    columns = [means if offset is None else means + np.asarray(offset), normals, sh[:, 0], rest]
+    columns += [_array(block.opacities)[:, None], _array(block.scales), _array(block.quats)]
     if block.levels is not None:
-        rows[:, end] = _array(block.levels)
-    return rows
-
-
-def check_replaces_ply(path: Path) -> None:
-    """Check that writing a PLY file replaces no file of another format, and that its folder exists.
-
-    FileExistsError: there is a file that is not empty and no PLY. FileNotFoundError: there is no such folder.
-    OSError: `path` is no regular file.
-    """
-    check_replaceable(path, (b"ply",), " and is not a PLY file")
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path.parent} is not a folder: make it first, or choose another one")
+        columns.append(_array(block.levels)[:, None])
+    return np.concatenate(columns, axis=1, dtype="<f4", casting="same_kind")
 
 
 def _array(tensor: Tensor) -> npt.NDArray[np.float32]:

@@ -69,7 +69,8 @@ def write_sog(path: Path, source: GaussianSource) -> None:
         places = (shares * 65535).round().int().numpy()
         codes["means_l"][rows], codes["means_u"][rows] = places & 255, places >> 8
         codes["scales"][rows] = _labels(block.scales, scales_book)
-        codes["quats"][rows] = _quats(block.quats)
+        others, largest = without_largest(block.quats, 8)
+        codes["quats"][rows] = torch.cat([others, 252 + largest[:, None]], dim=1).numpy()
         codes["sh0"][rows, :3] = _labels(block.sh[:, 0], colors_book)
         codes["sh0"][rows, 3] = (block.opacities.double().sigmoid() * 255).round().numpy()
         if palette is not None:
@@ -104,24 +105,18 @@ def write_sog(path: Path, source: GaussianSource) -> None:
 
 def _survey(source: GaussianSource) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Return the least and the largest `_logs`, and samples: scales, colours, other SH, opacity lengths."""
-    ends: list[list[Tensor]] = [[], [], []]
-    samples: list[list[Tensor]] = [[], [], [], []]
+    reach, samples = [], []
     step = max(1, len(source) // (_SAMPLE * _PALETTE))
     for block in unit_blocks(source):
-        columns = (_logs(block), block.scales, block.sh[:, 0])
-        for found, column in zip(ends, columns, strict=True):
-            found.append(torch.stack([column.amin(dim=0), column.amax(dim=0)]))
+        columns = torch.cat([_logs(block), block.scales.double(), block.sh[:, 0].double()], dim=1)
+        reach.append(torch.stack(columns.aminmax(dim=0)))
         some = block.rows(slice(None, None, step))
         shown = opacity_length(some.opacities, some.scales)
-        sampled = (some.scales, some.sh[:, 0], some.sh[:, 1:].flatten(1), shown)
-        for found, column in zip(samples, sampled, strict=True):
-            found.append(column.clone())
-    rows = (torch.cat(found) for found in ends)
-    reach, *others = (torch.stack([found.amin(dim=0), found.amax(dim=0)]) for found in rows)
-    scales, colors, rest, shown = (torch.cat(found) for found in samples)
+        samples.append(torch.cat([some.scales, some.sh.flatten(1), shown[:, None]], dim=1))
+    ends, rows = torch.stack(torch.cat(reach).aminmax(dim=0)), torch.cat(samples)
     # The ends are in the samples, because codebooks span them.
-    scales, colors = (torch.cat(pair) for pair in zip((scales, colors), others, strict=True))
-    return reach[0], reach[1], scales, colors, rest, shown
+    scales, colors = torch.cat([rows[:, :3], ends[:, 3:6]]), torch.cat([rows[:, 3:6], ends[:, 6:]])
+    return ends[0, :3], ends[1, :3], scales, colors, rows[:, 6:-1], rows[:, -1]
 
 
 def _logs(block: Gaussians) -> Tensor:
@@ -218,12 +213,6 @@ def _nearest(rows: Tensor, centres: Tensor) -> Tensor:
     lengths = (centres**2).sum(dim=1) / 2
     parts = rows.split(max(1, _TABLE // len(centres)))
     return torch.cat([torch.addmm(lengths, part, centres.T, alpha=-1).argmin(dim=1) for part in parts])
-
-
-def _quats(quats: Tensor) -> Bytes:
-    """Return unit quaternions as three bytes of the smaller components and one of the omitted one, [N, 4]."""
-    others, largest = without_largest(quats, 8)
-    return torch.cat([others, 252 + largest[:, None]], dim=1).to(torch.uint8).numpy()
 
 
 def read_sog(path: Path) -> Gaussians:
@@ -346,11 +335,10 @@ def _decoded(path: Path, archive: zipfile.ZipFile, meta: dict[str, Any], count: 
 
 def _webp_size(data: bytes, where: str) -> tuple[int, int]:
     """Return width and height of a WebP picture from its first chunk."""
-    head: npt.NDArray[np.uint8] = np.frombuffer(data[:30].ljust(30, b"\0"), np.uint8)
     kind = data[12:16]
     if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or kind not in (b"VP8L", b"VP8X"):
         raise ValueError(f"{where} is no lossless WebP picture")
     if kind == b"VP8L":
-        bits = int.from_bytes(head[21:25].tobytes(), "little")
+        bits = int.from_bytes(data[21:25], "little")
         return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-    return tuple(int.from_bytes(head[i : i + 3].tobytes(), "little") + 1 for i in (24, 27))  # type: ignore[return-value]
+    return int.from_bytes(data[24:27], "little") + 1, int.from_bytes(data[27:30], "little") + 1

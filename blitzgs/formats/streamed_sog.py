@@ -14,14 +14,14 @@ import json
 import zipfile
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from blitzgs.formats.gaussians import GaussianSource, is_antialiased
-from blitzgs.formats.partition import Partition, Parts, around, extents, interleaved
+from blitzgs.formats.gaussians import GaussianSource
+from blitzgs.formats.partition import Parts, around, extents, interleaved
 from blitzgs.formats.proxies import merged, moments, shown
 from blitzgs.formats.sog import write_sog
 from blitzgs.formats.tiles import TILE, Tile, Written, divided, new_folder, workers
@@ -31,8 +31,6 @@ from blitzgs.util.progress import Report
 META = "lod-meta.json"
 
 Array = npt.NDArray[np.float64]
-# Number of a part, and of its Gaussians.
-_Leaf: TypeAlias = tuple[int, int]
 # LODs of a leaf, and the Gaussians of one for each of the next.
 _LODS, _FEWER = 4, 4
 
@@ -49,17 +47,15 @@ def write_streamed_sog(
     Leaves have at most `most` Gaussians. All arguments and errors are those of `write_tiles`.
     """
     with new_folder(path) as folder:
-        partition = Partition(source, folder)
-        root, parts = divided(partition, most)
+        root, parts = divided(source, folder, most)
         # Parts are numbered in this order.
-        leaves = [(tile.part, tile.count) for tile in root.every() if tile.part is not None]
-        chosen = (parts, folder, partition.box, is_antialiased(source))
-        files: list[tuple[Array, int, int]] = []
+        leaves = [tile for tile in root.every() if not tile.children]
+        files = []
         with workers(processes) as run:
-            found = np.stack(list(run(partial(_edges, *chosen), leaves)))
-            edges = [0.0, *_medians(found, [count for _, count in leaves])]
+            found = np.stack(list(run(partial(_edges, parts), leaves)))
+            edges = [0.0, *_medians(found, [leaf.count for leaf in leaves])]
             jobs = [(leaf, lod, edge) for leaf in leaves for lod, edge in enumerate(edges)]
-            for file in run(partial(_encode, *chosen), jobs):
+            for file in run(partial(_encode, parts), jobs):
                 files.append(file)
                 report(len(files), len(jobs))
         parts.file.unlink()
@@ -78,14 +74,15 @@ def write_streamed_sog(
     return Written(len(jobs), size, len(source))
 
 
-def _name(leaf: _Leaf, lod: int) -> str:
-    return f"{lod}_{leaf[0]}"
+def _name(leaf: Tile, lod: int) -> str:
+    return f"{lod}_{leaf.part}"
 
 
-def _edges(parts: Parts, _: Path, box: Array, antialiased: bool, leaf: _Leaf) -> Array:
+def _edges(parts: Parts, leaf: Tile) -> Array:
     """Return the edges of the cells in which a leaf would have a quarter, a 16th and a 64th, [_LODS - 1]."""
-    rows, counts = moments(parts.read(leaf[0])), [max(1, leaf[1] // _FEWER**lod) for lod in range(1, _LODS)]
-    return np.array([merged(rows, count, box, antialiased)[1] for count in counts])
+    rows = moments(parts.read(leaf.part))
+    counts = [max(1, leaf.count // _FEWER**lod) for lod in range(1, _LODS)]
+    return np.array([merged(rows, count, parts.box, parts.antialiased)[1] for count in counts])
 
 
 def _medians(values: Array, weights: list[int]) -> list[float]:
@@ -96,20 +93,18 @@ def _medians(values: Array, weights: list[int]) -> list[float]:
     return [float(sorted_values[row, column]) for column, row in enumerate(middle)]
 
 
-def _encode(
-    parts: Parts, folder: Path, box: Array, antialiased: bool, job: tuple[_Leaf, int, float]
-) -> tuple[Array, int, int]:
+def _encode(parts: Parts, job: tuple[Tile, int, float]) -> tuple[Array, int, int]:
     """Write one LOD of a leaf, merged in cells of an edge; return its box, number of Gaussians and size."""
     leaf, lod, edge = job
-    gaussians = parts.read(leaf[0])
+    gaussians = parts.read(leaf.part)
     if lod > 0:
-        rows, _ = merged(moments(gaussians), leaf[1], box, antialiased, edge)
+        rows, _ = merged(moments(gaussians), leaf.count, parts.box, parts.antialiased, edge)
         gaussians = shown(rows, parts.comments)
     means = gaussians.means.double().numpy()
     sides = np.maximum(np.ptp(means, axis=0), 1e-30)
     cells = ((means - means.min(axis=0)) / sides * 1023).astype(np.int64)
     gaussians = gaussians.rows(torch.from_numpy(np.argsort(interleaved(cells, 10), kind="stable")))
-    chunk = folder / _name(leaf, lod)
+    chunk = parts.file.parent / _name(leaf, lod)
     chunk.mkdir()
     bundle = chunk / "bundle.sog"
     write_sog(bundle, gaussians)
@@ -126,7 +121,7 @@ def _node(tiles: list[Tile], files: list[tuple[Array, int, int]]) -> tuple[dict[
         nodes = [_node(some, files) for some in (tiles[:half], tiles[half:])]
         box = around([box for _, box in nodes])
         content: dict[str, Any] = {"children": [node for node, _ in nodes]}
-    elif tiles[0].part is None:
+    elif tiles[0].children:
         return _node(tiles[0].children, files)
     else:
         first = _LODS * tiles[0].part

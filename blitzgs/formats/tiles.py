@@ -23,6 +23,8 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
+from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from blitzgs.formats.gaussians import GaussianSource, is_antialiased
+from blitzgs.formats.gaussians import GaussianSource
 from blitzgs.formats.glb import EXTENSION, SPZ_EXTENSION, shortest_turn, write_glb, write_spz_glb
 from blitzgs.formats.partition import BITS, Partition, Parts, around, extents
 from blitzgs.formats.proxies import Rows, merged, moments, shown
@@ -43,6 +45,8 @@ TILESET, PAGE = "tileset.json", "index.html"
 TILE = 32_768
 # A tile has at most one Gaussian for so many of its children.
 _FEWER = 8
+# The temporary file with the moments of tiles that have children, each from its `first` row on.
+_PROXIES = "proxies.tmp"
 # Pixels of the error of a tile in which a cell of its merged Gaussians is one pixel wide.
 _PIXELS = 16
 
@@ -54,7 +58,7 @@ class Tile:
     """A node of the tree; the last three fields are known once its file is written."""
 
     count: int  # number of Gaussians; before a tile with children is written, the largest number
-    part: int | None = None  # number of the leaf's part; None: the tile has children
+    part: int = -1  # number of the leaf's part
     children: list[Tile] = field(default_factory=list)  # tiles of its eighths
     number: int = 0  # of its file
     first: int = 0  # row of its Gaussians among those of all tiles with children
@@ -112,20 +116,18 @@ def write_tiles(
         OSError: the disk is full, or `path` cannot be written; nothing is left.
     """
     with new_folder(path) as folder:
-        partition = Partition(source, folder)
-        root, parts = divided(partition, most)
+        root, parts = divided(source, folder, most)
         (folder / "tiles").mkdir()
-        writer = _Writer(folder, parts, partition.box, is_antialiased(source), spz)
-        _encode_all(writer, root, processes, report)
+        _encode_all(partial(_encode, parts, spz), root, processes, report)
         parts.file.unlink()
-        writer.proxies.unlink(missing_ok=True)
+        (folder / _PROXIES).unlink(missing_ok=True)
         content, _ = _node(root)
         content["transform"] = transform.T.ravel().tolist()
         names = [EXTENSION, SPZ_EXTENSION] if spz else [EXTENSION]
         tileset = {
             "asset": {"version": "1.1", "generator": "BlitzGS"},
             # As long as the scene is larger than that, something is shown.
-            "geometricError": max(partition.side, 2 * content["geometricError"]),
+            "geometricError": max(parts.side, 2 * content["geometricError"]),
             "root": content,
             # 3D Tiles 1.1 has GLB contents of its own; by this, viewers learn before the first content which
             # glTF extensions they need.
@@ -179,8 +181,12 @@ def new_folder(path: Path) -> Iterator[Path]:
         held.close()
 
 
-def divided(partition: Partition, most: int) -> tuple[Tile, Parts]:
-    """Divide a model into parts of at most so many Gaussians; return the root of their tree, and them."""
+def divided(source: GaussianSource, folder: Path, most: int) -> tuple[Tile, Parts]:
+    """Divide a model into parts of at most so many Gaussians; return the root of their tree, and them.
+
+    `folder`: of temporary files. ValueError, OSError: as `Partition`.
+    """
+    partition = Partition(source, folder)
     keys, counts = partition.cells, partition.counts
     parts = np.full(len(keys), -1, np.int64)
     number = first = 0
@@ -215,7 +221,7 @@ def divided(partition: Partition, most: int) -> tuple[Tile, Parts]:
         # A tile much smaller than others is not worth a request: its children are the parent's.
         small = most // _FEWER
         children = [one for child in children for one in (child.count < small and child.children or [child])]
-        return Tile(min(most, max(1, sum(child.count for child in children) // _FEWER)), None, children)
+        return Tile(min(most, max(1, sum(child.count for child in children) // _FEWER)), children=children)
 
     root = tile(np.arange(len(keys)), 0)
     for index, one in enumerate(root.every()):
@@ -243,63 +249,49 @@ def _prepare() -> None:
     torch.set_num_threads(1)
 
 
-def _encode_all(writer: _Writer, root: Tile, processes: int, report: Report) -> None:
+def _encode_all(
+    encode: Callable[[Tile], tuple[Array, int, int, float]], root: Tile, processes: int, report: Report
+) -> None:
     """Write all tiles, children before their parents."""
-    by_height: dict[int, list[Tile]] = {}
-    for tile in root.every():
-        by_height.setdefault(tile.height(), []).append(tile)
-    done, total = 0, sum(len(tiles) for tiles in by_height.values())
+    tiles, done = sorted(root.every(), key=Tile.height), 0
     with workers(processes) as run:
-        for _, tiles in sorted(by_height.items()):
-            for tile, found in zip(tiles, run(writer.encode, tiles), strict=True):
+        for _, level in groupby(tiles, key=Tile.height):
+            same = list(level)
+            for tile, found in zip(same, run(encode, same), strict=True):
                 tile.box, tile.count, tile.bytes, tile.edge = found
                 done += 1
-                report(done, total)
+                report(done, len(tiles))
 
 
-@dataclass(frozen=True)
-class _Writer:
-    """Writes files of tiles; may be sent to another process."""
+def _encode(parts: Parts, spz: bool, tile: Tile) -> tuple[Array, int, int, float]:
+    """Write the file of a tile; return its box, number of Gaussians, size, and edge of the cells."""
+    edge, folder = 0.0, parts.file.parent
+    if not tile.children:
+        gaussians = parts.read(tile.part)
+    else:
+        rows = np.concatenate([_moments(parts, child) for child in tile.children])
+        least = max(child.edge for child in tile.children)
+        most = min(tile.count, max(1, len(rows) // _FEWER))
+        rows, edge = merged(rows, most, parts.box, parts.antialiased, least)
+        with open(os.open(folder / _PROXIES, os.O_WRONLY | os.O_CREAT, 0o666), "wb") as file:
+            file.seek(tile.first * rows.itemsize * rows.shape[1])
+            file.write(rows.data)
+        gaussians = shown(rows, parts.comments)
+    path = folder / _uri(tile)
+    # glTF's up is +Y and that of 3D Tiles +Z; viewers turn contents between the two.
+    if spz:
+        write_spz_glb(path, gaussians)
+    else:
+        write_glb(path, gaussians, up=(0.0, 0.0, 1.0))
+    return extents(gaussians), len(gaussians), path.stat().st_size, edge
 
-    folder: Path  # of the tileset
-    parts: Parts  # the model's rows
-    box: Array  # where most of the model is, [2, 3]
-    antialiased: bool  # whether viewers compensate the screen-space blur
-    spz: bool  # whether files are compressed
 
-    @property
-    def proxies(self) -> Path:
-        """The temporary file with the moments of tiles that have children, each from its `first` row on."""
-        return self.folder / "proxies.tmp"
-
-    def encode(self, tile: Tile) -> tuple[Array, int, int, float]:
-        """Write the file of a tile; return its box, number of Gaussians, size, and edge of the cells."""
-        edge = 0.0
-        if tile.part is not None:
-            gaussians = self.parts.read(tile.part)
-        else:
-            rows = np.concatenate([self._moments(child) for child in tile.children])
-            least = max(child.edge for child in tile.children)
-            most = min(tile.count, max(1, len(rows) // _FEWER))
-            rows, edge = merged(rows, most, self.box, self.antialiased, least)
-            with open(os.open(self.proxies, os.O_WRONLY | os.O_CREAT, 0o666), "wb") as file:
-                file.seek(tile.first * rows.itemsize * rows.shape[1])
-                file.write(rows.data)
-            gaussians = shown(rows, self.parts.comments)
-        path = self.folder / _uri(tile)
-        # glTF's up is +Y and that of 3D Tiles +Z; viewers turn contents between the two.
-        if self.spz:
-            write_spz_glb(path, gaussians)
-        else:
-            write_glb(path, gaussians, up=(0.0, 0.0, 1.0))
-        return extents(gaussians), len(gaussians), path.stat().st_size, edge
-
-    def _moments(self, tile: Tile) -> Rows:
-        if tile.part is not None:
-            return moments(self.parts.read(tile.part))
-        width = self.parts.width - 2  # no level; a covariance has one number less than quaternion and scales
-        values = np.fromfile(self.proxies, "<f4", tile.count * width, offset=4 * tile.first * width)
-        return values.reshape(-1, width)
+def _moments(parts: Parts, tile: Tile) -> Rows:
+    if not tile.children:
+        return moments(parts.read(tile.part))
+    width = parts.width - 2  # no level; a covariance has one number less than quaternion and scales
+    file = parts.file.with_name(_PROXIES)
+    return np.fromfile(file, "<f4", tile.count * width, offset=4 * tile.first * width).reshape(-1, width)
 
 
 def _uri(tile: Tile) -> str:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import base64
 import html
 import json
+import re
 import zlib
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -84,7 +85,7 @@ def packed(splats: Gaussians) -> bytes:
     planes += [places & 255, places >> 8, sizes, tints, _quaternion_bytes(splats)]
     planes.append(np.rint(splats.opacities.sigmoid()[:, None].double().numpy() * 255))
     if splats.levels is not None:
-        planes.append(splats.levels[:, None].numpy())
+        planes.append(splats.levels[:, None].byte().numpy())
     rest = sh[:, 1:].reshape(len(splats), -1)
     planes.append(np.rint(rest / HARMONIC).clip(-127, 127).astype(np.int8).view(np.uint8))
     content = b"".join(
@@ -160,9 +161,5 @@ def as_html(text: str) -> str:
 
 
 def _filled(program: str, **fields: str) -> str:
-    pieces = _part("page.html").split("{{")
-    for index, piece in enumerate(pieces[1:], 1):
-        name, _, text = piece.partition("}}")
-        known = fields | {"program": _part(program)}
-        pieces[index] = (known[name] if name in known else _part(name)) + text
-    return "".join(pieces)
+    known = fields | {name: _part(name) for name in _PARTS} | {"program": _part(program)}
+    return re.sub(r"\{\{(.+?)\}\}", lambda found: known[found[1]], _part("page.html"))

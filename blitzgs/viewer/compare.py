@@ -22,18 +22,13 @@ ROWS = {3: 1, 2: 2, 1: 3}
 _BRIGHTEST = 0.25
 
 
-class Compared(NamedTuple):
-    """The composed image, uint8 [H, W, 3], and the PSNR in dB of the render over the photograph's pixels."""
+class Shaded(NamedTuple):
+    """Colours to show, uint8 [H, W, 3], and what is known of them."""
 
     image: UInt8
-    psnr: float
-
-
-def fitted(camera: CameraLike, width: int, height: int) -> Matrix:
-    """Return intrinsics [3, 3] of an image of a size into which a camera's photograph fits wholly."""
-    scale = min(width / camera.width, height / camera.height)
-    focal = float(camera.K[1, 1]) * scale
-    return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=np.float64)
+    low: float | None = None  # the number that the darkest colour stands for; None: it stands for none
+    high: float | None = None  # that of the brightest
+    psnr: float | None = None  # in dB, of a render over the pixels of its photograph; None: not compared
 
 
 def fitting_fov(camera: CameraLike, aspect: float) -> float:
@@ -50,7 +45,7 @@ def compare(
     K: Matrix,
     wipe: float = 0.5,
     columns: int = 3,
-) -> Compared:
+) -> Shaded:
     """Compose a render with the photograph of a camera at the same place.
 
     Args:
@@ -64,26 +59,30 @@ def compare(
     """
     height, width = render.shape[:2]
     placed, inside = _placed(photograph, camera, K, width, height)
-    difference = np.abs(render.astype(np.float32) - placed).mean(axis=2) * (inside > 0)
-    mean = (
-        float((((render.astype(np.float32) - placed) / 255) ** 2)[inside > 0].mean()) if inside.any() else 1.0
-    )
+    seen = inside[..., None]
+    difference = np.where(seen, render.astype(np.float32) - placed, 0)
+    mean = float(np.square(difference[inside] / 255).mean()) if inside.any() else 1.0
     psnr = -10 * math.log10(max(mean, 1e-12))
-    brightness = np.clip(difference / (255 * _BRIGHTEST), 0, 1)
-    error = cv2.applyColorMap((255 * brightness).astype(np.uint8), cv2.COLORMAP_INFERNO)[..., ::-1].astype(
-        np.uint8
-    )
+    brightness = np.clip(np.abs(difference).mean(axis=2) / (255 * _BRIGHTEST), 0, 1)
+    error = _coloured(brightness, cv2.COLORMAP_INFERNO)
     if kind == "side by side":
-        framed = render * (inside > 0)[..., None]
-        parts = [_labelled(placed, "photograph"), _labelled(framed, "render"), _labelled(error, "error")]
-        return Compared(_gridded(parts, columns), psnr)
+        pictures = {"photograph": placed, "render": render * seen, "error": error}
+        parts = [_labelled(picture, name) for name, picture in pictures.items()]
+        parts += [np.zeros_like(error)] * (columns * ROWS[columns] - len(parts))
+        rows = [np.concatenate(parts[k : k + columns], axis=1) for k in range(0, len(parts), columns)]
+        return Shaded(np.concatenate(rows), psnr=psnr)
     dark = (render * 0.35).astype(np.uint8)  # outside of the photograph
-    shown = np.where((inside > 0)[..., None], error if kind == "error" else render, dark)
+    shown = np.where(seen, error if kind == "error" else render, dark)
     if kind == "wipe":
         edge = int(round(np.clip(wipe, 0, 1) * width))
-        shown[:, :edge] = np.where((inside[:, :edge] > 0)[..., None], placed[:, :edge], dark[:, :edge])
+        shown[:, :edge] = np.where(seen, placed, dark)[:, :edge]
         shown[:, max(0, edge - 1) : edge + 1] = 255
-    return Compared(np.ascontiguousarray(shown), psnr)
+    return Shaded(np.ascontiguousarray(shown), psnr=psnr)
+
+
+def _coloured(shares: npt.NDArray[np.floating], table: int) -> UInt8:
+    """Return the colours of numbers from 0 to 1, uint8 [H, W, 3], by a table of OpenCV."""
+    return cv2.applyColorMap((255 * shares).astype(np.uint8), table)[..., ::-1].astype(np.uint8)
 
 
 def grid_columns(camera: CameraLike, width: int, height: int) -> int:
@@ -95,18 +94,12 @@ def grid_columns(camera: CameraLike, width: int, height: int) -> int:
     return max(ROWS, key=scale)
 
 
-def _gridded(parts: list[UInt8], columns: int) -> UInt8:
-    """Put images of one size into a grid, row by row."""
-    count = columns * ROWS[columns]
-    cells = parts + [np.zeros_like(parts[0])] * (count - len(parts))
-    rows = [np.concatenate(cells[k : k + columns], axis=1) for k in range(0, count, columns)]
-    return np.concatenate(rows, axis=0)
-
-
-def _placed(photograph: UInt8, camera: CameraLike, K: Matrix, width: int, height: int) -> tuple[UInt8, UInt8]:
+def _placed(
+    photograph: UInt8, camera: CameraLike, K: Matrix, width: int, height: int
+) -> tuple[UInt8, npt.NDArray[np.bool_]]:
     """Draw a photograph where an image with the same pose and the intrinsics `K` shows its pixels.
 
-    Returns the photograph, uint8 [H, W, 3], and where it is: uint8 [H, W], 0 outside.
+    Returns the photograph, uint8 [H, W, 3], and where it is, bool [H, W].
     """
     focal = np.array([K[0, 0] / camera.K[0, 0], K[1, 1] / camera.K[1, 1]])
     shrink = np.minimum(
@@ -121,36 +114,17 @@ def _placed(photograph: UInt8, camera: CameraLike, K: Matrix, width: int, height
     white = np.full(photograph.shape[:2], 255, np.uint8)
     placed = cv2.warpAffine(photograph, affine, (width, height), flags=cv2.INTER_LINEAR)
     inside = cv2.warpAffine(white, affine, (width, height), flags=cv2.INTER_NEAREST)
-    return placed.astype(np.uint8), inside.astype(np.uint8)
+    return placed.astype(np.uint8), inside > 0
 
 
 def _labelled(image: UInt8, text: str) -> UInt8:
-    """Return a copy of an image with a text in its upper left corner."""
+    """Return an image with a text in its upper left corner."""
     out = np.ascontiguousarray(image)
     size = max(0.4, image.shape[1] / 900)
+    place, font = (12, int(14 + 26 * size)), cv2.FONT_HERSHEY_SIMPLEX
     for colour, thickness in (((0, 0, 0), 4), ((255, 255, 255), 1)):
-        cv2.putText(
-            out,
-            text,
-            (12, int(14 + 26 * size)),
-            cv2.FONT_HERSHEY_SIMPLEX,
-            size,
-            colour,
-            thickness,
-            cv2.LINE_AA,
-        )
+        cv2.putText(out, text, place, font, size, colour, thickness, cv2.LINE_AA)
     return out
-
-
-class Shaded(NamedTuple):
-    """Colours to show, uint8 [H, W, 3], and the numbers that the darkest and the brightest colour stand for.
-
-    `low` and `high` are None for pictures that are colours already.
-    """
-
-    image: UInt8
-    low: float | None = None
-    high: float | None = None
 
 
 def shaded(picture: Picture, mode: str) -> Shaded:
@@ -173,6 +147,4 @@ def shaded(picture: Picture, mode: str) -> Shaded:
     if mode == "depth":
         share = 1 - share  # near is bright
     table = cv2.COLORMAP_TURBO if mode == "depth" else cv2.COLORMAP_INFERNO
-    colours = cv2.applyColorMap((share * 255).astype(np.uint8), table)[..., ::-1]
-    colours = np.where((values > 0)[..., None], colours, 0).astype(np.uint8)
-    return Shaded(np.ascontiguousarray(colours), low, high)
+    return Shaded(np.where((values > 0)[..., None], _coloured(share, table), np.uint8(0)), low, high)

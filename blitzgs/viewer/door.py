@@ -14,6 +14,7 @@ import ipaddress
 import os
 import socket
 import threading
+from concurrent.futures import Future
 from urllib.parse import urlsplit
 
 _MAX_HEAD = 32_768
@@ -21,11 +22,8 @@ _HEAD_SECONDS = 15.0
 _CHUNK = 1 << 18
 
 
-_Failure = OSError | OverflowError  # the address is not this machine's, or the number is no port
-
-
-def unheard(host: str, port: int, error: _Failure) -> OSError:
-    """Return the message of a viewer that cannot listen at its address."""
+def unheard(host: str, port: int, error: OSError | OverflowError) -> OSError:
+    """Return the message of a viewer that cannot listen at its address, or at a number that is no port."""
     if isinstance(error, OverflowError):
         why = "ports are 0 to 65535"
     elif isinstance(error, socket.gaierror):
@@ -44,52 +42,39 @@ class Door:
         `port`: 0: any free one. `behind`: port of 127.0.0.1 to forward to. `token`: beginning of the
         address's path; empty: none is needed.
         """
-        self._behind, self._token, self.port = behind, token, port
-        self._loop = asyncio.new_event_loop()
-        self._open: set[asyncio.Task[None]] = set()
-        started: list[_Failure | None] = []
-        ready = threading.Event()
+        self._behind, self._token = behind, token
+        self._started: Future[int] = Future()
         self._thread = threading.Thread(
-            target=self._serve, args=(host, port, started, ready), daemon=True, name="viewer door"
+            target=lambda: asyncio.run(self._serve(host, port)), daemon=True, name="viewer door"
         )
         self._thread.start()
-        ready.wait()
-        if started[0] is not None:
-            raise unheard(host, port, started[0]) from started[0]
+        try:
+            self.port = self._started.result()
+        except (OSError, OverflowError) as error:
+            raise unheard(host, port, error) from error
 
     def close(self) -> None:
         """Stop listening and end all connections."""
         with contextlib.suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(self._loop.stop)
+            self._loop.call_soon_threadsafe(self._ends.set)
         self._thread.join(timeout=2)
 
-    def _serve(self, host: str, port: int, started: list[_Failure | None], ready: threading.Event) -> None:
-        asyncio.set_event_loop(self._loop)
+    async def _serve(self, host: str, port: int) -> None:
+        """Listen until `close`; `asyncio.run` then ends all visits."""
+        self._loop, self._ends = asyncio.get_running_loop(), asyncio.Event()
         try:
-            server = self._loop.run_until_complete(asyncio.start_server(self._visit, host, port))
-            self.port = server.sockets[0].getsockname()[1]
-        except (OSError, OverflowError) as error:
-            started.append(error)
-            ready.set()
+            server = await asyncio.start_server(self._visit, host, port)
+        except Exception as error:
+            self._started.set_exception(error)
             return
-        started.append(None)
-        ready.set()
-        try:
-            self._loop.run_forever()
-        finally:
-            server.close()
-            for task in self._open:
-                task.cancel()
-            self._loop.run_until_complete(asyncio.gather(*self._open, return_exceptions=True))
-            self._loop.close()
+        self._started.set_result(server.sockets[0].getsockname()[1])
+        await self._ends.wait()
+        server.close()
 
     async def _visit(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        task = asyncio.current_task()
-        assert task is not None
-        self._open.add(task)
         try:
             with contextlib.suppress(
-                OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, TimeoutError
+                OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, asyncio.TimeoutError
             ):
                 head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _HEAD_SECONDS)
                 answer, passed = self._judged(head[:_MAX_HEAD].decode("latin-1"))
@@ -98,10 +83,7 @@ class Door:
                     await writer.drain()
                 else:
                     await self._pass_on(passed, reader, writer)
-        except asyncio.CancelledError:
-            pass
         finally:
-            self._open.discard(task)
             with contextlib.suppress(OSError, RuntimeError):
                 writer.close()
 

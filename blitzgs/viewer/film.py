@@ -11,23 +11,21 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from blitzgs.capture.cameras import camera_centres
 from blitzgs.runs.cameras import RunCamera, checked_camera
-from blitzgs.util.errors import optional_package
+from blitzgs.util.errors import located, optional_package
 from blitzgs.util.output import check_replaceable, new_file
 from blitzgs.view.draw import intrinsics
 from blitzgs.view.look import MAX_PIXELS
 from blitzgs.view.views import CameraLike, Space
-from blitzgs.viewer.paths import CameraPath, Keyframe, frames_from_json, from_json
-from blitzgs.viewer.world import SCALE, Array, Stance, World, horizontal, looking
+from blitzgs.viewer.paths import CameraPath, Keyframe, from_json
+from blitzgs.viewer.world import Array, Stance, World, horizontal, looking
 
-Tour = Literal["orbit", "flight", "spline"]
-TOURS: tuple[Tour, ...] = get_args(Tour)
+TOURS = ("orbit", "flight", "spline")
 # Keyframes of a circle and of a spline.
 _CIRCLE, _STATIONS = 48, 24
 # A flight looks at most so steeply down, so that the horizon's side of the scene is in the picture.
@@ -36,84 +34,65 @@ _STEEPEST = math.radians(35)
 _FLAT = math.radians(10)
 
 
-def tour(kind: Tour, world: World, fovs: list[float]) -> CameraPath:
-    """Make a path.
+def tour(kind: str, world: World) -> list[Keyframe]:
+    """Make the keyframes of one of `TOURS`.
 
     - "orbit": once around the scene's middle, as high and as far as the median camera.
     - "flight": straight across the middle, along the longest extent of the cameras, at their median height;
       looks ahead, as far down as the cameras do, but at most 35 degrees.
     - "spline": a smooth way through up to 24 cameras, in the order of their names.
 
-    `world`: of the scene; its poses are those of the cameras. `fovs`: vertical fields of view of these
-    cameras, radians. ValueError: a flight or a spline needs two cameras.
+    ValueError: a flight or a spline needs two cameras.
     """
     if kind != "orbit" and len(world.poses) < 2:
         raise ValueError(f"--path {kind} needs the cameras of a capture: use orbit, or the file of a path")
-    fov = float(np.median(fovs)) if fovs else world.start().fov
-    if kind == "orbit":
-        stances = _orbit(world, fov)
-    elif kind == "flight":
-        stances = _flight(world, fov)
-    else:
+    if kind == "spline":
         chosen = np.unique(np.linspace(0, len(world.poses) - 1, _STATIONS).round().astype(int))
-        stances = [world.stance(world.poses[index], fovs[index]) for index in chosen]
-    keys = [Keyframe(world.capture_pose(stance), math.degrees(stance.fov), 16 / 9) for stance in stances]
-    return CameraPath(keys, seconds=10.0, is_cycle=kind == "orbit")
+        stances = [world.stance(world.poses[index], world.fovs[index]) for index in chosen]
+    else:
+        stances = (_orbit if kind == "orbit" else _flight)(world)
+    return [Keyframe(world.capture_pose(stance), math.degrees(stance.fov), 16 / 9) for stance in stances]
 
 
-def _centres(world: World) -> Array:
-    return SCALE * camera_centres(np.stack(world.poses))
+def _above(world: World, places: Array) -> tuple[Array, float]:
+    """Return the way to places from the middle, without height, [V, 3], and their median height."""
+    heights = (places - world.middle) @ world.up
+    return places - world.middle - heights[:, None] * world.up, float(np.median(heights))
 
 
-def _orbit(world: World, fov: float) -> list[Stance]:
-    arms = _centres(world) - world.middle if world.poses else (world.start().position - world.middle)[None]
-    heights = arms @ world.up
-    flat = np.linalg.norm(arms - heights[:, None] * world.up, axis=1)
-    height = float(np.median(heights))
+def _orbit(world: World) -> list[Stance]:
+    start = world.start()
+    flat, height = _above(world, world.centres if world.poses else start.position[None])
+    fov = float(np.median(world.fovs)) if world.fovs else start.fov
     # Cameras straight above the middle would leave no circle.
-    radius = max(float(np.median(flat)), 0.7 * abs(height))
+    radius = max(float(np.median(np.linalg.norm(flat, axis=1))), 0.7 * abs(height))
     east, north = horizontal(world.up)
-    angles = np.arange(_CIRCLE) * 2 * math.pi / _CIRCLE
-    places = [
-        world.middle + radius * (math.cos(angle) * east + math.sin(angle) * north) + height * world.up
-        for angle in angles
-    ]
+    angles = np.arange(_CIRCLE)[:, None] * 2 * math.pi / _CIRCLE
+    places = world.middle + radius * (np.cos(angles) * east + np.sin(angles) * north) + height * world.up
     return [looking(place, world.middle, world.up, fov) for place in places]
 
 
-def _flight(world: World, fov: float) -> list[Stance]:
-    arms = _centres(world) - world.middle
-    heights = arms @ world.up
-    flat = arms - heights[:, None] * world.up
+def _flight(world: World) -> list[Stance]:
+    flat, height = _above(world, world.centres)
     _, _, axes = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
     ahead = axes[0] - world.up * (axes[0] @ world.up)
     ahead /= np.linalg.norm(ahead)
-    ends = np.quantile(flat @ ahead, (0.1, 0.9))
-    height = float(np.median(heights))
-    slopes = [math.asin(float(np.clip(pose[2, :3] @ world.up, -1, 1))) for pose in world.poses]
-    slope = max(-_STEEPEST, min(0.0, float(np.median(slopes))))
+    slopes = np.arcsin(np.clip([pose[2, :3] @ world.up for pose in world.poses], -1, 1))
+    slope = float(np.clip(np.median(slopes), -_STEEPEST, 0))
     view = ahead * math.cos(slope) + world.up * math.sin(slope)
     # The point on the ground that the camera looks at goes from end to end.
     behind = height / math.tan(-slope) if height > 0 and slope < -_FLAT else 0.0
+    ends, fov = np.quantile(flat @ ahead, (0.1, 0.9)), float(np.median(world.fovs))
     places = [world.middle + (along - behind) * ahead + height * world.up for along in ends]
     return [looking(place, place + view, world.up, fov) for place in places]
 
 
-# Size and frames a second of films that are made from the scene.
-SIZE, FPS = (1920, 1080), 30.0
+@dataclass
+class Film(CameraPath):
+    """A path whose keyframes may depend on the scene."""
 
-
-@dataclass(frozen=True)
-class Film:
-    """What is known of a film before the model is open."""
-
-    path: CameraPath | None  # its path; None: it is made from the scene
-    frames: list[Keyframe]  # viewpoints as the path's file has them; empty: computed from the keyframes
-    kind: str  # how the path is made from the scene
-    width: int  # pixels
-    height: int  # pixels
-    fps: float  # frames a second
-    seconds: float | None  # duration; None: the path's own
+    # One of `TOURS`, which gives the keyframes once the model is open; empty: they are known.
+    kind: str = ""
 
     def cameras(self, space: Space, cameras: Sequence[CameraLike], box: Array) -> list[RunCamera]:
         """Return the cameras of all frames, in the re-centred world.
@@ -121,30 +100,22 @@ class Film:
         `cameras`: of its capture; may be empty. `box`: corners of a box that holds nearly all Gaussians,
         [2, 3], trained units. ValueError: the path cannot be made without cameras.
         """
-        return [
-            self._camera(number, frame, space)
-            for number, frame in enumerate(self._frames(space, cameras, box), 1)
-        ]
-
-    def _frames(self, space: Space, cameras: Sequence[CameraLike], box: Array) -> list[Keyframe]:
-        if self.frames:
-            return self.frames
-        path = self.path
-        if path is None:
-            fovs = [2 * math.atan(camera.height / 2 / camera.K[1, 1]) for camera in cameras]
-            kind = next(kind for kind in TOURS if kind == self.kind)
-            path = tour(kind, World(space, cameras, box.mean(axis=0)), fovs)
-        return replace(path, fps=self.fps, seconds=self.seconds or path.seconds).frames()
-
-    def _camera(self, number: int, frame: Keyframe, space: Space) -> RunCamera:
-        pose = np.linalg.inv(frame.camera_to_world)
-        pose[:3, 3] += pose[:3, :3] @ np.array(space.offset)
-        K = intrinsics(self.width, self.height, math.radians(frame.fov))  # noqa: N806
-        return checked_camera(f"frame_{number:05}", self.width, self.height, K, pose)
+        keys = tour(self.kind, World(space, cameras, box)) if self.kind else self.keyframes
+        found = []
+        for number, frame in enumerate(replace(self, keyframes=keys).frames(), 1):
+            pose = np.linalg.inv(frame.camera_to_world)
+            pose[:3, 3] += pose[:3, :3] @ np.array(space.offset)
+            K = intrinsics(self.width, self.height, math.radians(frame.fov))  # noqa: N806
+            found.append(checked_camera(f"frame_{number:05}", self.width, self.height, K, pose))
+        return found
 
 
 def read_film(
-    source: str, size: tuple[int, int] | None, fps: float | None, seconds: float | None, moved: Path | None
+    source: str,
+    size: tuple[int, int] | None = None,
+    fps: float | None = None,
+    seconds: float | None = None,
+    moved: Path | None = None,
 ) -> Film:
     """Read the file of a path, or take the name of one that is made from the scene.
 
@@ -161,25 +132,22 @@ def read_film(
         ValueError: a file is damaged; names it, the place and the reason.
     """
     if source in TOURS:
-        width, height = size or SIZE
-        return Film(None, [], source, width, height, fps or FPS, seconds)
+        width, height = size or (1920, 1080)
+        return Film([], width, height, fps or 30.0, seconds or 10.0, source == "orbit", kind=source)
     file = Path(source)
     if not file.is_file():
         raise FileNotFoundError(f"--path {source}: there is no such file; {', '.join(TOURS)} need none")
-    try:
-        text = file.read_text(encoding="utf-8", errors="replace")
-        path = from_json(text)
-        frames = [] if fps or seconds else frames_from_json(text)
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
-    width, height = size or (path.width, path.height)
-    if max(width, height) > MAX_PIXELS:
+    with located(str(file)):
+        film = Film(**vars(from_json(file.read_text(encoding="utf-8", errors="replace"))))
+    film.width, film.height = size or (film.width, film.height)
+    if max(film.width, film.height) > MAX_PIXELS:
         raise ValueError(f"{file}: render_width and render_height must be at most {MAX_PIXELS}: use --size")
+    if fps or seconds:
+        film.fps, film.seconds, film.played = fps or film.fps, seconds or film.seconds, []
     if moved is not None:
         back = _back(moved)
-        frames = [back(key) for key in frames]
-        path = replace(path, keyframes=[back(key) for key in path.keyframes])
-    return Film(path, frames, "", width, height, fps or path.fps, seconds)
+        film.keyframes, film.played = [*map(back, film.keyframes)], [*map(back, film.played)]
+    return film
 
 
 def _back(file: Path) -> Callable[[Keyframe], Keyframe]:

@@ -35,15 +35,15 @@ class Frustums:
         cameras, test = exhibit.cameras, set(exhibit.test)
         self.indices = shown_cameras(len(cameras), test)  # cameras that have a frustum
         self._handles: list[Any] = []
-        size = frustum_size(world)
+        self._size = frustum_size(world)
         for index in self.indices:
             camera = cameras[index]
-            stance = world.stance(world.poses[index], 2 * math.atan(camera.height / (2 * camera.K[1, 1])))
+            stance = world.stance(world.poses[index], world.fovs[index])
             handle = server.scene.add_camera_frustum(
                 f"/cameras/{index}",
                 fov=stance.fov,
                 aspect=camera.width / camera.height,
-                scale=size,
+                scale=self._size,
                 thickness=1.5,
                 thickness_units="screen",
                 color=TEST_COLOUR if index in test else TRAIN_COLOUR,
@@ -60,10 +60,10 @@ class Frustums:
         for handle in self._handles:
             handle.visible = visible
 
-    def resize(self, factor: float, world: World) -> None:
+    def resize(self, factor: float) -> None:
         """Draw the frustums larger or smaller than usual."""
         for handle in self._handles:
-            handle.scale = frustum_size(world) * factor
+            handle.scale = self._size * factor
 
 
 def shown_cameras(count: int, test: set[int]) -> list[int]:
@@ -87,11 +87,9 @@ def _click(stand: Callable[[int | None, int], None], index: int) -> Callable[[An
 
 def frustum_size(world: World) -> float:
     """Return a size at which neighbouring frustums hardly overlap, page units."""
-    if len(world.poses) < 2:
+    if len(world.centres) < 2:
         return 0.2
-    centres = np.stack(
-        [world.stance(pose, 1.0).position for pose in world.poses[:: max(1, len(world.poses) // 200)]]
-    )
+    centres = world.centres[:: max(1, len(world.centres) // 200)]
     distances = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     np.fill_diagonal(distances, np.inf)
     nearest = float(np.median(distances.min(axis=1)))

@@ -12,7 +12,7 @@ import numpy as np
 
 from blitzgs.view.look import Picture, Wish
 from blitzgs.viewer.page import Page
-from blitzgs.viewer.visitor import Ask, Visitor
+from blitzgs.viewer.visitor import Ask
 from blitzgs.viewer.world import Exhibit
 
 # A curve is drawn with this many points at most.
@@ -31,7 +31,7 @@ class Curves:
         self.version = 0  # grows with every record
         self._total = total  # images of the whole run
         self._points: dict[str, list[tuple[int, float]]] = {name: [] for name in _SERIES}
-        self._held_out: list[tuple[int, float]] = []
+        self._held_out: float | None = None  # PSNR of the held-out views
         self._last: dict[str, Any] = {}
 
     def add(self, t: int, values: Mapping[str, Any]) -> None:
@@ -43,7 +43,7 @@ class Curves:
                     points.append((t, float(value)))
             self._last = {"t": t, **values}
         elif kind == "evaluation" and isinstance(psnr := values.get("psnr"), (int, float)):
-            self._held_out.append((t, float(psnr)))
+            self._held_out = float(psnr)
         elif kind == "pace":  # --minutes
             self._total = values["images"]
         else:
@@ -62,8 +62,8 @@ class Curves:
             parts.append(f"{last['psnr']:.2f} dB")
         if "images_per_second" in last:
             parts.append(f"{last['images_per_second']:.1f} images/s")
-        if self._held_out:
-            parts.append(f"held out: {self._held_out[-1][1]:.2f} dB")
+        if self._held_out is not None:
+            parts.append(f"held out: {self._held_out:.2f} dB")
         return " &middot; ".join(parts)
 
     def add_to(self, gui: Any) -> dict[str, Any]:
@@ -124,8 +124,8 @@ class Live:
         self._count = 0
         self._paused = self._saves = False
         self._allowed, self._refreshed, self._left_alone = 0.0, 0.0, 0.0
-        self._next: tuple[Visitor, Ask] | None = None  # to be drawn
-        self._last: tuple[Visitor, Ask] | None = None  # being drawn
+        self._next: Ask | None = None  # to be drawn
+        self._last: Ask | None = None  # being drawn
         self._sent = 0.0
         self._folders: dict[int, Any] = {}
         self._ends = threading.Event()
@@ -145,13 +145,13 @@ class Live:
             self._next = self._asked_for()
         return self._next is not None
 
-    def _asked_for(self) -> tuple[Visitor, Ask] | None:
+    def _asked_for(self) -> Ask | None:
         """Return a picture that a visitor waits for, if there is one."""
         now = time.monotonic()
         if not self._paused and now >= self._refreshed + _REFRESH_SECONDS:
             self._refreshed = now
             for visitor in list(self.page.visitors.values()):
-                visitor.refresh()
+                visitor.is_stale = True
         found = self.page.next_ask()
         if found is None:
             self._allowed = now + _IDLE_SECONDS
@@ -170,25 +170,23 @@ class Live:
         self._last, self._next = self._next, None
         if self._last is None and self._paused and self.page.visitors:
             self._last = self._asked_for()
-        return Wish(None if self._last is None else self._last[1].look, self._paused, saves)
+        return Wish(None if self._last is None else self._last.look, self._paused, saves)
 
     def show(self, picture: Picture, seconds: float) -> None:
         """Send a picture, and note what it cost."""
         if self._last is None:
             return
-        visitor, ask = self._last
         # Packing and sending the pictures before this one took time of the same processor.
         sent, self._sent = self.page.send_seconds - self._sent, self.page.send_seconds
         begin = time.monotonic()
-        self.page.deliver(visitor, ask, picture)
+        self.page.deliver(self._last, picture)
         spent = seconds + sent + time.monotonic() - begin
         self._allowed = time.monotonic() + spent * (1 / self._share - 1)
 
     def failed(self, reason: str) -> None:
         """Tell the visitor that there is no picture."""
         if self._last is not None:
-            visitor, ask = self._last
-            visitor.failed(ask, reason)
+            self._last.visitor.failed(self._last, reason)
         self._allowed = time.monotonic() + 1.0
 
     def told(self, t: int, values: Mapping[str, Any]) -> None:

@@ -19,7 +19,7 @@ from blitzgs.viewer.door import Door, is_loopback
 from blitzgs.viewer.frustums import Frustums
 from blitzgs.viewer.panel import Panel, overlay
 from blitzgs.viewer.settings import MOVING_MS
-from blitzgs.viewer.visitor import Ask, Shown, Visitor
+from blitzgs.viewer.visitor import Ask, Visitor
 from blitzgs.viewer.world import Exhibit, World
 
 if TYPE_CHECKING:
@@ -65,15 +65,12 @@ class Page:
         self.exhibit, self.folders, self.memory = exhibit, folders, memory
         self.woken = threading.Event()  # set when a picture may be needed
         self.visitors: dict[int, Visitor] = {}  # those who look at present, by viser's numbers
-        self.panels: dict[int, Panel] = {}
         self.send_seconds = 0.0  # of a processor, that packing pictures has taken so far
         self._moving_ms = moving_ms
-        self._figured: dict[int, float] = {}
         self._turn = 0
         self._sender = ThreadPoolExecutor(1, "viewer sender")
         self._sending = threading.Semaphore(2)
-        box = exhibit.box
-        self.world = World(exhibit.space, exhibit.cameras, box.mean(axis=0))
+        self.world = World(exhibit.space, exhibit.cameras, exhibit.box)
         # Its address behind the door is nobody's concern.
         with contextlib.redirect_stdout(io.StringIO()):
             self._server = viser.ViserServer(host="127.0.0.1", port=0, label=exhibit.title, verbose=False)
@@ -108,26 +105,23 @@ class Page:
 
     def _enter(self, client: viser.ClientHandle) -> None:
         visitor = Visitor(client, self.world, self.exhibit, self.woken.set, self._moving_ms)
-        panel = Panel(visitor, self.frustums)
         if self.folders is not None:
             self.folders(client)
-        panel.build()
-        self.panels[client.client_id] = panel
+        Panel(visitor, self.frustums)
         self.visitors[client.client_id] = visitor
         self.woken.set()
 
     def _leave(self, client: viser.ClientHandle) -> None:
         visitor = self.visitors.pop(client.client_id, None)
         if visitor is not None:
-            visitor.leave()
-        self.panels.pop(client.client_id, None)
+            visitor.is_gone = True
         self.woken.set()
 
     def _stand(self, client_id: int | None, index: int) -> None:
         for visitor in [v for number, v in list(self.visitors.items()) if client_id in (None, number)]:
             visitor.stand_at(index)
 
-    def next_ask(self) -> tuple[Visitor, Ask] | None:
+    def next_ask(self) -> Ask | None:
         """Return the next picture that a visitor waits for; they take turns. None: there is none."""
         visitors = list(self.visitors.values())
         for shift in range(len(visitors)):
@@ -140,20 +134,20 @@ class Page:
                 continue
             if ask is not None:
                 self._turn += shift + 1
-                return visitor, ask
+                return ask
         return None
 
-    def deliver(self, visitor: Visitor, ask: Ask, picture: Picture) -> None:
-        """Send a picture to a visitor; drops it if two others have not been sent within a second."""
+    def deliver(self, ask: Ask, picture: Picture) -> None:
+        """Send a picture to its visitor; drops it if two others have not been sent within a second."""
         if not self._sending.acquire(timeout=_SEND_SECONDS):
             return
         try:
-            self._sender.submit(self._send, visitor, ask, picture)
+            self._sender.submit(self._send, ask, picture)
         except RuntimeError:  # the page is closed
             self._sending.release()
 
-    def _send(self, visitor: Visitor, ask: Ask, picture: Picture) -> None:
-        begin = time.thread_time()
+    def _send(self, ask: Ask, picture: Picture) -> None:
+        visitor, begin, busy = ask.visitor, time.monotonic(), time.thread_time()
         try:
             shown = visitor.take(ask, picture)
             if shown is None or visitor.client.client_id not in self.visitors:
@@ -163,22 +157,16 @@ class Page:
             visitor.client.scene.set_background_image(
                 shown.image, format="jpeg", jpeg_quality=88 if sharp else 70
             )
-            self._figures(visitor, shown, sharp)
+            if sharp or begin >= visitor.figured + _FIGURES_SECONDS:
+                visitor.figured = begin
+                visitor.figures.content = overlay(visitor, shown, self.memory())
         except Exception as error:
             # A browser that has gone, or one picture less: neither may end the page or a training.
             if visitor.client.client_id in self.visitors:
                 warn(f"the viewer could not send a picture: {error}")
         finally:
-            self.send_seconds += time.thread_time() - begin
+            self.send_seconds += time.thread_time() - busy
             self._sending.release()
-
-    def _figures(self, visitor: Visitor, shown: Shown, sharp: bool) -> None:
-        number, now = visitor.client.client_id, time.monotonic()
-        if not sharp and now < self._figured.get(number, 0.0) + _FIGURES_SECONDS:
-            return
-        self._figured[number] = now
-        if (panel := self.panels.get(number)) is not None:
-            panel.figures.content = overlay(visitor, shown, self.memory())
 
     def close(self) -> None:
         """Stop to serve."""

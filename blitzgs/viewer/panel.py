@@ -18,7 +18,7 @@ from blitzgs.view.draw import LEVEL_COLOURS
 from blitzgs.view.look import MODES
 from blitzgs.viewer import compare
 from blitzgs.viewer.frustums import Frustums
-from blitzgs.viewer.paths import Route, note, safe_name, save_beside
+from blitzgs.viewer.paths import Route
 from blitzgs.viewer.settings import Triple
 from blitzgs.viewer.visitor import Shown, Visitor
 from blitzgs.viewer.world import SCALE
@@ -32,31 +32,27 @@ KEYS = "Keys: W A S D move level, Q down, E up, arrows turn. Click a frustum to 
 
 
 class Panel:
-    """Builds the controls, and changes the visitor's settings as they are used."""
-
-    figures: Any  # the element with the figures over the picture
+    """The controls of a visitor, which change the visitor's settings as they are used."""
 
     def __init__(self, visitor: Visitor, frustums: Frustums) -> None:
-        """Prepare the controls of a visitor."""
-        self._visitor, self._frustums, self._exhibit = visitor, frustums, visitor.exhibit
-        self._gui: Any = visitor.client.gui
-
-    def build(self) -> None:
         """Add all controls."""
-        self.figures = self._gui.add_html("")
-        with self._gui.add_folder("Show"):
+        self._visitor, self._frustums, self._exhibit = visitor, frustums, visitor.exhibit
+        gui: Any = visitor.client.gui
+        self._gui = gui
+        visitor.figures = gui.add_html("")
+        with gui.add_folder("Show"):
             self._show()
         if self._exhibit.cameras:
-            with self._gui.add_folder("Photographs"):
+            with gui.add_folder("Photographs"):
                 self._photographs()
-        with self._gui.add_folder("Move"):
+        with gui.add_folder("Move"):
             self._move()
-        with self._gui.add_folder("Model", expand_by_default=False):
+        with gui.add_folder("Model", expand_by_default=False):
             self._model()
-        with self._gui.add_folder("Crop box", expand_by_default=False):
+        with gui.add_folder("Crop box", expand_by_default=False):
             self._crop()
-        with self._gui.add_folder("Viewpoints and path", expand_by_default=False):
-            Route(self._visitor, self._gui).build()
+        with gui.add_folder("Viewpoints and path", expand_by_default=False):
+            Route(visitor, gui)
 
     def _bind(self, control: Any, choice: str, convert: Callable[[Any], Any] = lambda value: value) -> None:
         """Change a field of the visitor's settings whenever a control is used."""
@@ -78,7 +74,7 @@ class Panel:
         if (few := len(self._frustums.indices)) < len(exhibit.cameras):
             gui.add_markdown(f"{few} of {len(exhibit.cameras):,} are shown; *Camera* below reaches all.")
         size = gui.add_slider("Camera size", min=0.1, max=4.0, step=0.1, initial_value=1.0)
-        size.on_update(lambda _: self._frustums.resize(size.value, visitor.world))
+        size.on_update(lambda _: self._frustums.resize(size.value))
         number = gui.add_slider(
             "Camera", min=0, max=max(1, len(exhibit.cameras) - 1), step=1, initial_value=0
         )
@@ -117,7 +113,8 @@ class Panel:
         tell()
 
     def _move(self) -> None:
-        visitor, gui = self._visitor, self._gui
+        visitor, gui, world = self._visitor, self._gui, self._visitor.world
+        start = world.start()
         motion = gui.add_button_group("Motion", tuple(MOTIONS))
         fov = gui.add_slider(
             "Field of view", min=10, max=110, step=1, initial_value=50, hint="Vertical, degrees"
@@ -128,7 +125,7 @@ class Panel:
 
         fov.on_update(turn)
         gui.add_button("Level the horizon").on_click(lambda _: visitor.go(visitor.stance))
-        gui.add_button("Back to the start").on_click(lambda _: self._restart())
+        gui.add_button("Back to the start").on_click(lambda _: visitor.go(start, world.distance(start)))
         help_text = gui.add_markdown("")
 
         def moves(_: Any) -> None:
@@ -140,11 +137,6 @@ class Panel:
 
         motion.on_click(moves)
         tell()
-
-    def _restart(self) -> None:
-        world = self._visitor.world
-        start = world.start()
-        self._visitor.go(start, float(np.linalg.norm(start.position - world.middle)))
 
     def _model(self) -> None:
         gui, exhibit = self._gui, self._exhibit
@@ -186,7 +178,7 @@ class Panel:
             outline.dimensions = tuple(high - low)
             outline.position = (low + high) / 2
             outline.visible = crops.value
-            visitor.change(crops=crops.value, box=box)
+            visitor.change(crop=box if crops.value else None)
 
         for control in (crops, *sliders):
             control.on_update(update)
@@ -197,9 +189,7 @@ class Panel:
         if shown is None:
             return
         content = encode_image(torch.from_numpy(shown.image), ".png")
-        name = f"{safe_name(self._exhibit.title)}_{time.strftime('%Y%m%d_%H%M%S')}.png"
-        visitor.client.send_file_download(name, content, save_immediately=True)
-        note(visitor, save_beside(self._exhibit.paths, name, content))
+        visitor.save(f"{self._exhibit.title}_{time.strftime('%Y%m%d_%H%M%S')}", ".png", content)
 
 
 _BOX = (
@@ -252,7 +242,7 @@ def scale_bar(visitor: Visitor) -> str:
     camera = visitor.client.camera
     distance = float(np.linalg.norm(np.array(camera.look_at) - np.array(camera.position)))
     if visitor.motion != "orbit":
-        distance = float(np.linalg.norm(visitor.world.middle - visitor.stance.position))
+        distance = visitor.world.distance(visitor.stance)
     # Height of the view at this distance in the capture's unit, or in metres if these are known. The picture
     # is as high as the page; beside the panel it is less wide.
     frame, unit = visitor.exhibit.frame, visitor.exhibit.space.unit

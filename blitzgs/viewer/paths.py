@@ -9,19 +9,14 @@ from __future__ import annotations
 
 import json
 import math
-import re
-import threading
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from blitzgs.util.output import write_file
 from blitzgs.viewer.world import Stance
 
 if TYPE_CHECKING:
@@ -51,46 +46,36 @@ class CameraPath:
     fps: float = 24.0  # frames a second
     seconds: float = 4.0  # duration of the film
     is_cycle: bool = False  # whether the last keyframe leads to the first
+    # All frames as another program computed them; empty: they follow from the keyframes.
+    played: list[Keyframe] = field(default_factory=list)
 
     def frames(self) -> list[Keyframe]:
         """Return the viewpoints of all frames: positions on a Catmull-Rom spline, rotations interpolated."""
+        if self.played:
+            return self.played
         count = max(1, round(self.fps * self.seconds))
         keys = self.keyframes + (self.keyframes[:1] if self.is_cycle else [])
-        if len(keys) < 2:
+        last = len(keys) - 1
+        if last < 1:
             return keys * count
-        times = np.linspace(0, len(keys) - 1, count, endpoint=not self.is_cycle)
-        return [interpolated(keys, float(time), self.is_cycle) for time in times]
-
-
-def interpolated(keys: Sequence[Keyframe], time: float, is_cycle: bool = False) -> Keyframe:
-    """Return the viewpoint at a time, counted in keyframes from 0."""
-    first = min(int(time), len(keys) - 2)
-    share, last = time - first, len(keys) - 1
-
-    def position(index: int) -> Array:
-        if is_cycle:  # the last keyframe is the first again
-            index %= last
-        return keys[min(max(index, 0), last)].camera_to_world[:3, 3]
-
-    p0, p1, p2, p3 = (position(first + shift) for shift in (-1, 0, 1, 2))
-    place = 0.5 * (
-        2 * p1
-        + (p2 - p0) * share
-        + (2 * p0 - 5 * p1 + 4 * p2 - p3) * share**2
-        + (3 * p1 - p0 - 3 * p2 + p3) * share**3
-    )
-    a, b = keys[first], keys[first + 1]
-    pose = np.eye(4)
-    pose[:3, :3] = _slerp(a.camera_to_world[:3, :3], b.camera_to_world[:3, :3], share)
-    pose[:3, 3] = place
-    return Keyframe(pose, a.fov + share * (b.fov - a.fov), a.aspect + share * (b.aspect - a.aspect))
-
-
-def _slerp(a: Array, b: Array, share: float) -> Array:
-    """Turn from rotation `a` to `b` about one axis by a share of the angle."""
-    turn = cv2.Rodrigues(a.T @ b)[0]
-    turned: Array = a @ cv2.Rodrigues(share * turn)[0]
-    return turned
+        places, frames = np.stack([key.camera_to_world[:3, 3] for key in keys]), []
+        for at in np.linspace(0, last, count, endpoint=not self.is_cycle).tolist():
+            first = min(int(at), last - 1)
+            share, around = at - first, first + np.arange(-1, 3)
+            p0, p1, p2, p3 = places[around % last if self.is_cycle else around.clip(0, last)]
+            a, b, pose = keys[first], keys[first + 1], np.eye(4)
+            # The rotation turns about one axis.
+            turn = cv2.Rodrigues(a.camera_to_world[:3, :3].T @ b.camera_to_world[:3, :3])[0]
+            pose[:3, :3] = a.camera_to_world[:3, :3] @ cv2.Rodrigues(share * turn)[0]
+            pose[:3, 3] = 0.5 * (
+                2 * p1
+                + (p2 - p0) * share
+                + (2 * p0 - 5 * p1 + 4 * p2 - p3) * share**2
+                + (3 * p1 - p0 - 3 * p2 + p3) * share**3
+            )
+            fov, aspect = a.fov + share * (b.fov - a.fov), a.aspect + share * (b.aspect - a.aspect)
+            frames.append(Keyframe(pose, fov, aspect))
+        return frames
 
 
 def to_json(path: CameraPath) -> str:
@@ -107,7 +92,7 @@ def to_json(path: CameraPath) -> str:
         "seconds": path.seconds,
         "is_cycle": path.is_cycle,
         "smoothness_value": 0.0,
-        "default_fov": path.keyframes[0].fov if path.keyframes else 50.0,
+        "default_fov": path.keyframes[0].fov,
         "default_transition_sec": path.seconds / max(1, len(path.keyframes) - (not path.is_cycle)),
         "keyframes": keyframes,
         "camera_path": frames,
@@ -122,25 +107,18 @@ def from_json(text: str) -> CameraPath:
     ValueError: it is no camera path; the message says where and why.
     """
     content = _content(text)
-    keys = _viewpoints(content, "keyframes") or _viewpoints(content, "camera_path")
-    if not keys:
+    keys, played = _viewpoints(content, "keyframes"), _viewpoints(content, "camera_path")
+    if not (keys or played):
         raise ValueError(f"{_NO_PATH}: it has neither keyframes nor camera_path")
     return CameraPath(
-        keys,
+        keys or played,
         round(_number(content, "render_width", 1920, 1)),
         round(_number(content, "render_height", 1080, 1)),
         _number(content, "fps", 24.0, 0.01),
         _number(content, "seconds", 4.0, 0.0),
         bool(content.get("is_cycle", False)),
+        played,
     )
-
-
-def frames_from_json(text: str) -> list[Keyframe]:
-    """Return the frames that a path has as its program computed them; empty if it has only keyframes.
-
-    ValueError: as `from_json`.
-    """
-    return _viewpoints(_content(text), "camera_path")
 
 
 _NO_PATH = "this is no camera path in the layout of nerfstudio"
@@ -210,129 +188,90 @@ RECORD_SECONDS = 0.5
 
 
 class Route:
-    """The path that one visitor makes."""
+    """The path that one visitor makes, and the controls for it."""
 
     def __init__(self, visitor: Visitor, gui: Any) -> None:
-        """Begin with an empty path."""
-        self._visitor, self._gui = visitor, gui
-        self.path = CameraPath()
+        """Add the controls; the path is empty."""
+        self._visitor = visitor
+        self._path = CameraPath()
         self._noted = 0.0
-        self._playing = threading.Event()
-
-    def build(self) -> None:
-        """Add the controls."""
-        gui = self._gui
+        self._plays = False
         self._count = gui.add_markdown("No viewpoint yet")
-        gui.add_button("Add viewpoint").on_click(lambda _: self.add())
+        gui.add_button("Add viewpoint").on_click(lambda _: self._add())
         self._records = gui.add_checkbox("Record movement", False, hint="A viewpoint every half second")
         self._seconds = gui.add_number("Seconds", 4.0, min=0.1, max=3600.0, step=0.5)
         self._cycle = gui.add_checkbox("Closed", False)
-        gui.add_button("Play").on_click(lambda _: self.play())
+        gui.add_button("Play").on_click(lambda _: self._play())
         self._name = gui.add_text("Name", "path")
-        gui.add_button("Save path").on_click(lambda _: self.save())
-        gui.add_button("Remove the last").on_click(lambda _: self.remove())
-        gui.add_button("Clear").on_click(lambda _: self.clear())
+        gui.add_button("Save path").on_click(lambda _: self._save())
+        gui.add_button("Remove the last").on_click(lambda _: self._cut(-1))
+        gui.add_button("Clear").on_click(lambda _: self._cut(0))
         upload = gui.add_upload_button("Load a path", mime_type="application/json")
-        upload.on_upload(lambda _: self.load(upload.value.content))
-        self._visitor.listeners.append(self._moved)
+        upload.on_upload(lambda _: self._load(upload.value.content))
+        visitor.listeners.append(self._moved)
 
-    def add(self) -> None:
-        """Add the present viewpoint."""
+    def _add(self) -> None:
         visitor = self._visitor
         stance, aspect = visitor.stance, visitor.client.camera.aspect
         pose = visitor.world.capture_pose(stance)
-        self.path.keyframes.append(Keyframe(pose, math.degrees(stance.fov), aspect))
+        self._path.keyframes.append(Keyframe(pose, math.degrees(stance.fov), aspect))
         self._tell()
 
     def _moved(self) -> None:
-        if (
-            self._records.value
-            and time.monotonic() > self._noted + RECORD_SECONDS
-            and not self._playing.is_set()
-        ):
-            self._noted = time.monotonic()
-            self.add()
+        now = time.monotonic()
+        if self._records.value and now > self._noted + RECORD_SECONDS and not self._plays:
+            self._noted = now
+            self._add()
 
-    def remove(self) -> None:
-        """Remove the last viewpoint."""
-        if self.path.keyframes:
-            self.path.keyframes.pop()
-        self._tell()
-
-    def clear(self) -> None:
-        """Remove all viewpoints."""
-        self.path.keyframes.clear()
+    def _cut(self, first: int) -> None:
+        """Remove the viewpoints from one on."""
+        del self._path.keyframes[first:]
         self._tell()
 
     def _tell(self) -> None:
-        count = len(self.path.keyframes)
+        count = len(self._path.keyframes)
         self._count.content = f"{count} viewpoint{'s' * (count != 1)}"
 
-    def stance_of(self, key: Keyframe) -> Stance:
-        """Return a viewpoint in the page's coordinates."""
+    def _go(self, key: Keyframe) -> None:
+        """Move the visitor to a viewpoint."""
         pose = key.camera_to_world
         position = self._visitor.world.page_position(pose[:3, 3])
-        return Stance(position, pose[:3, :3].copy(), math.radians(key.fov))
+        self._visitor.go(Stance(position, pose[:3, :3].copy(), math.radians(key.fov)))
 
-    def _timed(self) -> CameraPath:
-        self.path.seconds, self.path.is_cycle = float(self._seconds.value), bool(self._cycle.value)
-        return self.path
+    def _timed(self) -> CameraPath | None:
+        """Return the path as the controls say; without viewpoints, tell the visitor, and return None."""
+        if not self._path.keyframes:
+            self._visitor.note("add a viewpoint first")
+            return None
+        self._path.seconds, self._path.is_cycle = float(self._seconds.value), bool(self._cycle.value)
+        return self._path
 
-    def play(self) -> None:
+    def _play(self) -> None:
         """Move the visitor along the path, or stop if it is being played."""
-        if self._playing.is_set():
-            self._playing.clear()
+        if self._plays or (path := self._timed()) is None:
+            self._plays = False
             return
-        if not self.path.keyframes:
-            note(self._visitor, "add a viewpoint first")
-            return
-        self._playing.set()
-        frames, begin = self._timed().frames(), time.monotonic()
-        while self._playing.is_set():
-            index = int((time.monotonic() - begin) * self.path.fps)
-            if index >= len(frames) or self._visitor.is_gone:
+        self._plays = True
+        frames, begin = path.frames(), time.monotonic()
+        while self._plays and not self._visitor.is_gone:
+            index = int((time.monotonic() - begin) * path.fps)
+            if index >= len(frames):
                 break
-            self._visitor.go(self.stance_of(frames[index]))
+            self._go(frames[index])
             time.sleep(0.05)
-        self._playing.clear()
+        self._plays = False
 
-    def save(self) -> None:
-        """Write the path beside the run, and give it to the browser."""
-        if not self.path.keyframes:
-            note(self._visitor, "add a viewpoint first")
-            return
-        text, name = to_json(self._timed()), safe_name(self._name.value) + ".json"
-        self._visitor.client.send_file_download(name, text.encode(), save_immediately=True)
-        note(self._visitor, save_beside(self._visitor.exhibit.paths, name, text))
+    def _save(self) -> None:
+        if (path := self._timed()) is not None:
+            self._visitor.save(self._name.value, ".json", to_json(path).encode())
 
-    def load(self, content: bytes) -> None:
+    def _load(self, content: bytes) -> None:
         """Take over a path from a file, and go to its first viewpoint."""
         try:
-            self.path = from_json(content.decode())
-        except (ValueError, UnicodeDecodeError) as error:
-            note(self._visitor, str(error))
+            self._path = replace(from_json(content.decode()), played=[])
+        except ValueError as error:
+            self._visitor.note(str(error))
             return
-        self._seconds.value, self._cycle.value = self.path.seconds, self.path.is_cycle
+        self._seconds.value, self._cycle.value = self._path.seconds, self._path.is_cycle
         self._tell()
-        if self.path.keyframes:
-            self._visitor.go(self.stance_of(self.path.keyframes[0]))
-
-
-def save_beside(folder: Path, name: str, content: bytes | str) -> str:
-    """Write a file into the folder for paths and screenshots; return what to tell the visitor."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_file(folder / name, content)
-    except OSError as error:
-        return f"the file is in the browser's downloads; {folder} cannot be written: {error}"
-    return f"saved as {folder / name}"
-
-
-def note(visitor: Visitor, text: str) -> None:
-    """Show a note on the visitor's page for some seconds."""
-    visitor.client.add_notification("BlitzGS", text, auto_close_seconds=6.0)
-
-
-def safe_name(text: str) -> str:
-    """Return a text as the name of a file."""
-    return re.sub(r"[^\w.-]+", "_", text).strip("._") or "view"
+        self._go(self._path.keyframes[0])

@@ -22,8 +22,7 @@ class Settings:
     background: Triple | None = None  # RGB in [0, 1]
     lod: bool = True  # apply the LOD gate
     smooth: bool | None = None  # fade its levels
-    crops: bool = False  # leave out what is outside of the box
-    box: tuple[Triple, Triple] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))  # the box's corners
+    crop: tuple[Triple, Triple] | None = None  # corners of a box; what is outside is left out. None: nothing
     near: float | None = None  # None: the model's
     far: float | None = None  # None: the model's
     comparison: str = "off"  # one of `blitzgs.viewer.compare.KINDS`
@@ -50,7 +49,7 @@ class Settings:
             background=self.background,
             lod=self.lod,
             smooth=self.smooth,
-            crop=self.box if self.crops else None,
+            crop=self.crop,
             near=self.near,
             far=self.far,
         )

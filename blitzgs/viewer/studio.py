@@ -166,20 +166,19 @@ class Studio:
         page = self.page
         while not self._ends.is_set():
             page.woken.clear()
-            asked = page.next_ask()
-            if asked is None:
+            ask = page.next_ask()
+            if ask is None:
                 # Look again soon: a camera that rests for a while gets a finer picture.
                 page.woken.wait(0.05 if page.visitors else 1.0)
                 continue
-            visitor, ask = asked
             try:
                 picture = self._drawer.draw(ask.look)
             except RuntimeError as error:  # most likely out of memory
-                visitor.failed(ask, str(error))
+                ask.visitor.failed(ask, str(error))
                 continue
             self.drawn += 1
             if picture is not None:
-                page.deliver(visitor, ask, picture)
+                page.deliver(ask, picture)
 
     def close(self) -> None:
         """Stop drawing, and close the page."""

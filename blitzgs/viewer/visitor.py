@@ -4,23 +4,25 @@
 from __future__ import annotations
 
 import math
+import re
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
+from blitzgs.util.output import write_file
 from blitzgs.util.rotations import quaternion_matrices
 from blitzgs.view.draw import intrinsics
 from blitzgs.view.look import Look, Picture
 from blitzgs.viewer import compare
 from blitzgs.viewer.compare import Shaded, shaded
 from blitzgs.viewer.settings import STILL_SECONDS, Pace, Settings
-from blitzgs.viewer.world import SCALE, Exhibit, Stance, World
+from blitzgs.viewer.world import SCALE, Exhibit, Stance, World, horizontal, looking
 
 if TYPE_CHECKING:
     import viser
@@ -36,6 +38,7 @@ EYE_HEIGHT = 0.01
 class Ask:
     """A picture that a visitor waits for."""
 
+    visitor: Visitor
     look: Look  # what to draw
     version: int  # number of the visitor's viewpoint and choices
     scale: float  # side relative to full quality
@@ -51,9 +54,9 @@ class Ask:
 class Shown:
     """The newest picture of a visitor, for the figures on the page and for screenshots."""
 
-    image: npt.NDArray[np.uint8]
     ask: Ask
     picture: Picture
+    image: npt.NDArray[np.uint8]  # [H, W, 3]; this and the rest as in `Shaded`
     low: float | None
     high: float | None
     psnr: float | None
@@ -80,16 +83,18 @@ class Visitor:
         self.shown: Shown | None = None  # the newest picture
         self.motion = "orbit"  # "orbit", "fly" or "walk"
         self.standing: int | None = None
-        self._place: Stance | None = None  # of the camera at which the visitor stands
         self._arrived = 0.0
         self._lock = threading.Lock()
         self.version, self._drawn = 0, -1
         self._drawn_scale = 0.0
         self._moved, self._stance = 0.0, self._read()
+        self._place = self._stance  # of the camera at which the visitor stands
         self._pace = Pace(moving_ms)
         self._sounded = -1
-        self._stale = False
-        self._gone = threading.Event()
+        self.is_stale = False  # the model has changed: another picture is wanted, as fine as the last
+        self.is_gone = False  # the browser has closed the page
+        self.figures: Any = None  # the element of the page with the figures over the picture
+        self.figured = 0.0  # when they were last updated
         self.listeners: list[Callable[[], None]] = []
         client.camera.on_update(self._on_camera)
 
@@ -98,7 +103,7 @@ class Visitor:
     @property
     def stance(self) -> Stance:
         """Where the visitor is; exactly the photograph's camera for one who stands there."""
-        return self._place if self.standing is not None and self._place is not None else self._stance
+        return self._stance if self.standing is None else self._place
 
     def _read(self) -> Stance:
         camera = self.client.camera
@@ -111,7 +116,7 @@ class Visitor:
         with self._lock:
             same = stance.is_near(self._stance, 1e-6, 1e-6) and stance.fov == self._stance.fov
             self._stance = stance
-            if self.standing is not None and self._place is not None:
+            if self.standing is not None:
                 here = stance.is_near(self._place, 0.02, 0.01)
                 if here or time.monotonic() < self._arrived + _ARRIVING_SECONDS:
                     return
@@ -151,20 +156,18 @@ class Visitor:
         with self.client.atomic():
             camera.up_direction = self.world.up if up is None else up
             camera.position = stance.position
-            camera.look_at = stance.position + stance.forward * distance
+            camera.look_at = stance.position + stance.rotation[:, 2] * distance
             camera.fov = stance.fov
 
     def stand_at(self, index: int) -> None:
         """Put the visitor where a photograph was taken."""
         camera = self.exhibit.cameras[index]
-        pose = self.world.poses[index]
         fov = compare.fitting_fov(camera, self.client.camera.aspect)
-        stance = self.world.stance(pose, fov)
-        distance = float(np.linalg.norm(stance.position - self.world.middle))
+        stance = self.world.stance(self.world.poses[index], fov)
         with self._lock:
             self.standing, self._place, self._arrived = index, stance, time.monotonic()
             self.version += 1
-        self.go(stance, max(0.1, distance), up=-stance.rotation[:, 1])
+        self.go(stance, max(0.1, self.world.distance(stance)), up=-stance.rotation[:, 1])
         self._wake()
         self._tell()
 
@@ -178,85 +181,64 @@ class Visitor:
     def choose_motion(self, motion: str) -> None:
         """Choose how the camera moves: "orbit", "fly" or "walk"."""
         self.motion = motion
-        distance = None
-        if motion == "orbit":
-            distance = float(np.linalg.norm(self.stance.position - self.world.middle))
-        self.go(self.stance, distance)
-
-    def refresh(self) -> None:
-        """Ask for a new picture of the same, as fine as the last, for a model that has changed."""
-        self._stale = True
+        self.go(self.stance, self.world.distance(self.stance) if motion == "orbit" else None)
 
     # -- pictures ------------------------------------------------------------------------------------------
-
-    @property
-    def is_moving(self) -> bool:
-        """Tell whether the camera moved just now."""
-        return time.monotonic() < self._moved + STILL_SECONDS
 
     def next_ask(self) -> Ask | None:
         """Return what to draw next; None: nothing at present."""
         with self._lock:
-            moving, version, settings = self.is_moving, self.version, self.settings
+            moving = time.monotonic() < self._moved + STILL_SECONDS
+            version, settings = self.version, self.settings
             drawn = self._drawn_scale if self._drawn == version else None
             scale = (
                 self._pace.next_scale(drawn, moving) if settings.adapts else (1.0 if drawn is None else None)
             )
             stance, index = self.stance, self.standing
-            if scale is None and self._stale and not moving:
+            if scale is None and self.is_stale and not moving:
                 scale = drawn
             if scale == 1.0:
-                self._stale = False
+                self.is_stale = False
             if scale is None:
                 if self.motion == "walk" and not moving and self._sounded != version:
                     self._sounded = version
                     return self._sounding(stance, version, settings)
                 return None
-        camera = self.client.camera
         try:
-            return self._ask(stance, index, camera.image_width, camera.image_height, scale, version, settings)
+            return self._ask(stance, index, scale, version, settings)
         except (ValueError, ArithmeticError):  # an impossible choice, such as a near plane behind the far one
             with self._lock:
                 self._drawn, self._drawn_scale = version, 1.0
             return None
 
-    def _ask(
-        self,
-        stance: Stance,
-        index: int | None,
-        width: int,
-        height: int,
-        scale: float,
-        version: int,
-        settings: Settings,
-    ) -> Ask:
+    def _ask(self, stance: Stance, index: int | None, scale: float, version: int, settings: Settings) -> Ask:
+        """Return what to draw; `index`: of the camera at which the visitor stands."""
         exposure = self.exhibit.exposures.get(index) if settings.exposure and index is not None else None
         if settings.comparison == "off" or self.exhibit.photograph is None:
             index = None
         elif index is None:
             settings = replace(settings, comparison="off")
-        columns = 1
-        share = scale * min(1.0, settings.most_side / max(width, height, 1))
-        w, h = max(16, round(width * share)), max(16, round(height * share))
-        if index is not None and settings.comparison == "side by side":
-            columns = compare.grid_columns(self.exhibit.cameras[index], w, h)
-            w, h = max(16, w // columns), max(16, h // compare.ROWS[columns])
+        sides = self.client.camera.image_width, self.client.camera.image_height
+        share = scale * min(1.0, settings.most_side / max(*sides, 1))
+        width, height = (max(16, round(side * share)) for side in sides)
+        columns, fov = 1, stance.fov
         if index is not None:
-            K = compare.fitted(self.exhibit.cameras[index], w, h)  # noqa: N806
-        else:
-            K = intrinsics(w, h, stance.fov)  # noqa: N806
-        look = settings.look(self.world.viewmat(stance), K, w, h)
-        return Ask(look, version, scale, settings, index, columns, exposure)
+            camera = self.exhibit.cameras[index]
+            if settings.comparison == "side by side":
+                columns = compare.grid_columns(camera, width, height)
+                width, height = max(16, width // columns), max(16, height // compare.ROWS[columns])
+            fov = compare.fitting_fov(camera, width / height)
+        K = intrinsics(width, height, fov)  # noqa: N806
+        look = settings.look(self.world.viewmat(stance), K, width, height)
+        return Ask(self, look, version, scale, settings, index, columns, exposure)
 
     def _sounding(self, stance: Stance, version: int, settings: Settings) -> Ask:
         """Return a look straight down, to find the ground under a visitor who walks."""
-        down = -self.world.up
-        side = stance.rotation[:, 0] - self.world.up * float(stance.rotation[:, 0] @ self.world.up)
-        side = side / max(1e-9, float(np.linalg.norm(side)))
-        rotation = np.stack([side, np.cross(down, side), down], axis=1)
-        pose = self.world.viewmat(Stance(stance.position, rotation, 0.2))
+        up = self.world.up
+        down = looking(stance.position, stance.position - up, horizontal(up)[0], 0.2)
         plain = replace(settings, mode="depth", comparison="off", near=1e-6)
-        return Ask(plain.look(pose, intrinsics(32, 32, 0.2), 32, 32), version, 1.0, plain, is_sounding=True)
+        look = plain.look(self.world.viewmat(down), intrinsics(32, 32, down.fov), 32, 32)
+        return Ask(self, look, version, 1.0, plain, is_sounding=True)
 
     def take(self, ask: Ask, picture: Picture) -> Shown | None:
         """Note a drawn picture, and return what to show; None: nothing, or it is out of date."""
@@ -269,7 +251,7 @@ class Visitor:
                 self._drawn, self._drawn_scale = ask.version, ask.scale
             else:
                 return None
-        result, psnr = shaded(picture, ask.look.mode), None
+        result = shaded(picture, ask.look.mode)
         if ask.exposure is not None and ask.look.mode == "RGB":
             gain, bias = ask.exposure
             exposed = np.clip(result.image * gain + 255 * bias + 0.5, 0, 255).astype(np.uint8)
@@ -278,12 +260,10 @@ class Visitor:
             try:
                 photograph = self.exhibit.photograph(ask.camera)
             except (OSError, ValueError, RuntimeError):
-                return Shown(result.image, ask, picture, None, None, None)
-            camera = self.exhibit.cameras[ask.camera]
-            kind, wipe = ask.settings.comparison, ask.settings.wipe
-            compared = compare.compare(kind, result.image, photograph, camera, ask.look.K, wipe, ask.columns)
-            result, psnr = Shaded(compared.image), compared.psnr
-        return Shown(result.image, ask, picture, result.low, result.high, psnr)
+                return Shown(ask, picture, *result)
+            camera, kind, wipe = self.exhibit.cameras[ask.camera], ask.settings.comparison, ask.settings.wipe
+            result = compare.compare(kind, result.image, photograph, camera, ask.look.K, wipe, ask.columns)
+        return Shown(ask, picture, *result)
 
     def _step_to_ground(self, ask: Ask, picture: Picture) -> None:
         known = picture.values[picture.values > 0]
@@ -296,17 +276,25 @@ class Visitor:
         stance = self.stance
         self.go(replace(stance, position=stance.position - self.world.up * (height - eye)))
 
-    @property
-    def is_gone(self) -> bool:
-        """Tell whether the browser has closed the page."""
-        return self._gone.is_set()
-
-    def leave(self) -> None:
-        """Note that the browser has closed the page."""
-        self._gone.set()
-
     def failed(self, ask: Ask, reason: str) -> None:
         """Note that a picture cannot be drawn, and tell the visitor; the next movement asks again."""
         with self._lock:
             self._drawn, self._drawn_scale = max(ask.version, self._drawn), 1.0
         self.client.add_notification("BlitzGS", reason, auto_close_seconds=10.0, color="red")
+
+    def note(self, text: str) -> None:
+        """Show a note on the page for some seconds."""
+        self.client.add_notification("BlitzGS", text, auto_close_seconds=6.0)
+
+    def save(self, name: str, suffix: str, content: bytes) -> None:
+        """Give a file to the browser, write it into the folder for paths and screenshots, and say so."""
+        name = (re.sub(r"[^\w.-]+", "_", name).strip("._") or "view") + suffix
+        self.client.send_file_download(name, content, save_immediately=True)
+        folder = self.exhibit.paths
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_file(folder / name, content)
+        except OSError as error:
+            self.note(f"the file is in the browser's downloads; {folder} cannot be written: {error}")
+        else:
+            self.note(f"saved as {folder / name}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from blitzgs.capture.world import GEOCENTRIC, WorldFrame, converted, reference_s
 from blitzgs.config.fields import Config, ModelConfig
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased
-from blitzgs.formats.models import offset_of, open_gaussians
+from blitzgs.formats.models import offset_of, open_gaussians, with_degree
 from blitzgs.formats.selection import opacity_length
 from blitzgs.formats.tiles import upright
 from blitzgs.formats.web_page import WebLevels, WebScene, estimated_bytes, frame_bytes, web_page
@@ -61,17 +61,17 @@ def web_file(opened: Opened, max_bytes: int) -> WebFile:
     `opened`: the model. `max_bytes`: size of the file. ValueError: the model has no visible Gaussian, or none
     fits.
     """
-    table, exhibit, full_degree = opened.table, opened.exhibit, opened.exhibit.sh_degree
-    degree, space = opened.subject.options.sh_degree, max_bytes - frame_bytes()
-    rows = _seen(table)
+    table, exhibit, options, lod = opened.table, opened.exhibit, opened.subject.options, opened.subject.lod
+    space, rows = max_bytes - frame_bytes(), _seen(table)
     if len(rows) == 0:
         raise ValueError(f"{exhibit.title} has no Gaussian that can be seen")
-    levels = opened.subject.lod is not None
-    splats, visible = _splats(table, rows, degree, levels), len(rows)
+    degree, visible = options.sh_degree, len(rows)
+    splats = _splats(table, rows, degree, lod is not None)
     while degree > 0 and estimated_bytes(splats) > space:
         degree -= 1
-        splats = _of_degree(splats, degree)
-    scene = _scene(opened)
+        splats = with_degree(splats, degree)
+    world = World(exhibit.space, exhibit.cameras, exhibit.box)
+    scene = web_scene(world, options, 1.0, None if lod is None else _levels(lod))
     kept = min(visible, int(0.99 * visible * space / estimated_bytes(splats)))
     if kept < visible:
         score = contributions(opened.subject, exhibit.cameras, opened.ranks)
@@ -79,14 +79,13 @@ def web_file(opened: Opened, max_bytes: int) -> WebFile:
     while True:
         if kept < 1:
             raise ValueError(f"a file of {max_bytes / 1e6:g} MB holds no Gaussian: choose a larger --max-mb")
-        if kept < visible:
-            splats = _splats(table, rows[:kept], degree, levels)
         parts = []
         if kept < visible:
+            splats = _splats(table, rows[:kept], degree, lod is not None)
             left, whole = visible - kept + opened.unread, visible + opened.unread
             parts.append(f"{left:,} of {whole:,} Gaussians, those that contribute least")
-        if degree < full_degree:
-            parts.append(f"colours by direction beyond SH degree {degree} of {full_degree}")
+        if degree < exhibit.sh_degree:
+            parts.append(f"colours by direction beyond SH degree {degree} of {exhibit.sh_degree}")
         left_out = f"Left out to stay below {max_bytes / 1e6:g} MB: {'; '.join(parts)}." if parts else ""
         text = web_page(splats, scene, exhibit.title, left_out)
         if len(text.encode()) <= max_bytes:
@@ -120,17 +119,7 @@ def _splats(table: GaussianTable, rows: Tensor, degree: int, levels: bool) -> Ga
     names = ["means", "quats", "scales", "opacities", "sh", *(["level"] if levels else [])]
     means, quats, scales, opacities, sh, *level = (table[name][rows].cpu() for name in names)
     found = Gaussians(means, quats, scales, opacities, sh, levels=level[0] if level else None)
-    return _of_degree(found, degree)
-
-
-def _of_degree(splats: Gaussians, degree: int) -> Gaussians:
-    return replace(splats, sh=splats.sh[:, : (degree + 1) ** 2])
-
-
-def _scene(opened: Opened) -> WebScene:
-    exhibit, lod = opened.exhibit, opened.subject.lod
-    world = World(exhibit.space, exhibit.cameras, exhibit.box.mean(axis=0))
-    return web_scene(world, opened.subject.options, 1.0, None if lod is None else _levels(lod))
+    return with_degree(found, degree)
 
 
 def web_scene(world: World, options: RenderOptions, unit: float, lod: WebLevels | None = None) -> WebScene:
@@ -217,7 +206,7 @@ def open_city(path: Path, checked: bool = True) -> City:
         config = Config(model=ModelConfig(antialiased=is_antialiased(source), near=1e-3))
     else:
         space, config = run.space, run.config
-    world = World(space, cameras, box.mean(axis=0) / space.unit)
+    world = World(space, cameras, box / space.unit)
     scene = web_scene(world, render_options(config, space, source.degree), space.unit)
     return City(source, offset, space.extent * space.unit, frame, scene, path.resolve().stem)
 

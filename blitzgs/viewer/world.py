@@ -30,11 +30,6 @@ class Stance:
     rotation: Array  # camera to world, [3, 3]; the axes are right, down and forward
     fov: float  # radians
 
-    @property
-    def forward(self) -> Array:
-        """The direction of view."""
-        return self.rotation[:, 2]
-
     def is_near(self, other: Stance, distance: float = 1e-3, angle: float = 0.005) -> bool:
         """Tell whether another stance differs by less than a distance (page units) and an angle (radians)."""
         cosine = (np.trace(self.rotation.T @ other.rotation) - 1) / 2
@@ -45,16 +40,18 @@ class Stance:
 class World:
     """Maps between the page's coordinates, the trained ones and those of the capture."""
 
-    def __init__(self, space: Space, cameras: Sequence[CameraLike], middle: Array | None = None) -> None:
+    def __init__(self, space: Space, cameras: Sequence[CameraLike], box: Array) -> None:
         """Find up and the middle of a scene.
 
-        `space`: the trained world. `cameras`: the capture's; may be empty. `middle`: a point in the middle of
-        the Gaussians, trained units; None: guess it from the cameras.
+        `space`: the trained world. `cameras`: the capture's; may be empty. `box`: corners of a box that holds
+        nearly all Gaussians, [2, 3], trained units.
         """
         self.space = space
         self.poses = [viewmat(camera, space) for camera in cameras]
+        self.fovs = [2 * math.atan(camera.height / (2 * camera.K[1, 1])) for camera in cameras]
+        self.centres = SCALE * camera_centres(np.stack(self.poses)) if self.poses else np.zeros((0, 3))
         self.up = up_direction(self.poses)
-        self.middle = SCALE * (middle if middle is not None else np.zeros(3))
+        self.middle = SCALE * box.mean(axis=0)
 
     def viewmat(self, stance: Stance) -> Array:
         """Return the pose [4, 4], trained world to camera."""
@@ -67,6 +64,10 @@ class World:
         """Return the stance of a pose [4, 4], trained world to camera."""
         rotation = pose[:3, :3].T
         return Stance(-rotation @ pose[:3, 3] * SCALE, rotation.copy(), fov)
+
+    def distance(self, stance: Stance) -> float:
+        """Return how far a stance is from the middle, page units."""
+        return float(np.linalg.norm(stance.position - self.middle))
 
     def capture_position(self, position: Array) -> Array:
         """Return a position of the page in the capture's coordinates."""
@@ -84,15 +85,13 @@ class World:
 
     def start(self) -> Stance:
         """Return a first stance: slanted from above the middle, from as far as the cameras are."""
-        distance, fov = 1.2 * SCALE * self.space.extent, math.radians(50)
+        distance = 1.2 * SCALE * self.space.extent
         if self.poses:
-            centres = SCALE * camera_centres(np.stack(self.poses))
-            distance = (
-                float(np.clip(np.median(np.linalg.norm(centres - self.middle, axis=1)), 0.2, distance)) * 1.3
-            )
+            away = float(np.median(np.linalg.norm(self.centres - self.middle, axis=1)))
+            distance = 1.3 * min(max(away, 0.2), distance)
         _, north = horizontal(self.up)
-        away = north * -0.8 + self.up * 0.6
-        return looking(self.middle + away * distance, self.middle, self.up, fov)
+        position = self.middle + distance * (0.6 * self.up - 0.8 * north)
+        return looking(position, self.middle, self.up, math.radians(50))
 
 
 def horizontal(up: Array) -> tuple[Array, Array]:

@@ -286,7 +286,8 @@ def test_a_training_of_a_project_knows_its_world_and_resuming_keeps_an_alignment
     np.testing.assert_allclose(geodetic(place), [47.5, 8.25, 432.0], atol=1e-8)
     opened = open_viewed(run, Ranks())
     visitor = SimpleNamespace(
-        world=World(opened.exhibit.space, opened.exhibit.cameras), exhibit=opened.exhibit, motion="orbit",
+        world=World(opened.exhibit.space, opened.exhibit.cameras, opened.exhibit.box),
+        exhibit=opened.exhibit, motion="orbit",
         client=SimpleNamespace(camera=SimpleNamespace(look_at=(0, 0, 1), position=(0, 0, 0), aspect=1.5)),
     )  # fmt: skip
     visitor.stance = Stance(visitor.world.page_position(np.zeros(3)), np.eye(3), 0.8)

@@ -32,27 +32,7 @@ SCENE = WebScene(0.01, 100.0, 0.3, False, (0.1, 0.2, 0.3), (0, 0, 1), (0, -3, 1)
 
 
 def some_splats(count=700, degree=2):
-    random = np.random.default_rng(0)
-
-    def normal(*shape):
-        return random.normal(size=shape).astype(np.float32)
-
-    sh = 0.2 * normal(count, (degree + 1) ** 2, 3)
-    opacities = random.uniform(0, 1, count).astype(np.float32)
-    levels = random.integers(0, 5, count).astype(np.uint8)
-    means, quats, scales = normal(count, 3), normal(count, 4), normal(count, 3) - 4
-    columns = [torch.from_numpy(column) for column in (means, quats, scales, opacities, sh, levels)]
-    return Gaussians(*columns[:3], columns[3].logit(), columns[4], levels=columns[5])
-
-
-def rotations(quats):
-    """Return the matrices [N, 3, 3] of quaternions w, x, y, z by their products with the basis vectors."""
-    w, v = quats[:, :1], quats[:, 1:]
-    columns = []
-    for basis in np.eye(3):
-        t = 2 * np.cross(v, basis)
-        columns.append(basis + w * t + np.cross(v, t))
-    return np.stack(columns, axis=2)
+    return some_gaussians(count, degree, levels=True)
 
 
 class Reader:
@@ -89,8 +69,8 @@ def test_all_values_come_back():
     largest = np.sqrt(1 - (three**2).sum(1))
     for row, (others, place) in enumerate(zip(three, words >> 30, strict=True)):
         quats[row] = np.insert(others, place, largest[row])
-    unit = torch.nn.functional.normalize(splats.quats).numpy()
-    assert np.abs(rotations(quats) - rotations(unit)).max() < 5e-3
+    found, wanted = (Rotation.from_quat(np.roll(some, -1, axis=1)) for some in (quats, splats.quats))
+    assert (found.inv() * wanted).magnitude().max() < 5e-3
     assert np.abs(reader.planes(1)[0] / 255 - splats.opacities.sigmoid().numpy()).max() < 0.51 / 255
     np.testing.assert_array_equal(reader.planes(1)[0], splats.levels.numpy())
     rest = reader.planes(24).view(np.int8) * HARMONIC

@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import os
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -28,6 +27,7 @@ from blitzgs.viewer.studio import Studio, open_model
 from blitzgs.viewer.web import web_file
 from blitzgs.viewer.world import looking
 from tests.browser import Browser, wait_for
+from tests.viewer.test_page import settled
 
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
 WIDTH = 1200
@@ -42,28 +42,20 @@ def save(browser: Browser, name: str) -> None:
     cv2.imwrite(str(IMAGES / name), image, [cv2.IMWRITE_JPEG_QUALITY, 82])
 
 
-def settle(visitor) -> None:  # noqa: ANN001
-    time.sleep(1)
-    wait_for(
-        lambda: visitor.shown.ask.scale == 1.0 and visitor.shown.ask.version == visitor.version, 120, "sharp"
-    )
-    time.sleep(1)
-
-
 def at_rest(run: Path, data: Path | None) -> None:
     studio = Studio(open_model(run, Ranks(), photographs(run, data)), port=0)
     with Browser(studio.page.url, 1600, 900) as browser:
         wait_for(browser.figures, 120, "a picture")
-        visitor = next(iter(studio.page.visitors.values()))
+        visitor = settled(studio)
         world, start = studio.page.world, studio.page.world.start()
         visitor.go(
             looking(world.middle + 1.15 * (start.position - world.middle), world.middle, world.up, 0.9), 5
         )
-        settle(visitor)
+        settled(studio)
         save(browser, "view_page.jpg")
         visitor.stand_at(studio.page.exhibit.test[len(studio.page.exhibit.test) // 2])
         visitor.change(comparison="wipe", wipe=0.5)
-        settle(visitor)
+        settled(studio)
         save(browser, "view_compare.jpg")
     studio.close()
 
@@ -83,8 +75,7 @@ def report(run: Path) -> None:
 def sent(run: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "scene.html"
-        page = web_file(open_model(run, Ranks()), 50_000_000)
-        file.write_text(page.text)
+        file.write_text(web_file(open_model(run, Ranks()), 50_000_000).text)
         with Browser(file.as_uri(), 1280, 720) as browser:
             wait_for(lambda: browser.evaluate("window.blitzgs?.scene.count"), 60, "the page's program")
             browser.evaluate("blitzgs.ready")
@@ -94,24 +85,18 @@ def sent(run: Path) -> None:
 
 
 def live(data: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "blitzgs", "train", "--config", "smoke", "--data", str(data)]
         training = subprocess.Popen(
-            [*command, "--out", f"{folder}/city", f"--viewer={port}"],
+            [*command, "--out", f"{folder}/city", "--viewer=0"],
             stdout=subprocess.PIPE,
             text=True,
             env=os.environ | {"PYTHONUNBUFFERED": "1"},
         )
-        for line in training.stdout:
-            if "viewer: open" in line:
-                break
-        with Browser(f"http://localhost:{port}/", 1600, 900) as browser:
+        url = next(line.split()[-1] for line in training.stdout if "viewer: open" in line)
+        with Browser(url, 1600, 900) as browser:
             wait_for(browser.figures, 120, "a picture")
-            for line in training.stdout:
-                if line.strip().startswith("400/"):
-                    break
+            next(line for line in training.stdout if line.strip().startswith("400/"))
             time.sleep(8)
             save(browser, "view_live.jpg")
         os.kill(training.pid, signal.SIGTERM)

@@ -8,6 +8,8 @@ import re
 import socket
 import threading
 import time
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,9 +21,11 @@ from blitzgs.cli.view import photographs
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.folder import open_run
 from blitzgs.training.trainer import Trainer
+from blitzgs.view.draw import Drawer
 from blitzgs.viewer.paths import from_json
 from blitzgs.viewer.studio import Studio, open_model
-from blitzgs.viewer.world import SCALE
+from blitzgs.viewer.visitor import EYE_HEIGHT
+from blitzgs.viewer.world import SCALE, looking
 from tests.browser import Browser, needs_chromium, wait_for
 from tests.helpers import export_ply
 from tests.training.tiny import tiny_config, tiny_scene
@@ -51,9 +55,8 @@ def picture(browser):
 def studio(trained):
     data, folder = trained
     opened = open_model(folder, Ranks(), photographs(folder, data))
-    studio = Studio(opened, port=0)
-    yield studio
-    studio.close()
+    with contextlib.closing(Studio(opened, port=0)) as studio:
+        yield studio
 
 
 @pytest.fixture(scope="module")
@@ -65,16 +68,13 @@ def browser(studio):
 
 def test_pictures_take_their_share_of_a_training(tmp_path):
     trainer = Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks())
-    live = live_page(trainer.state, 0, "127.0.0.1")
-    try:
+    with contextlib.closing(live_page(trainer.state, 0, "127.0.0.1")) as live:
         assert not live.wants()  # nobody looks
-        live._last = (None, None)
+        live._last = SimpleNamespace()
         live.page.deliver = lambda *_: None
         before = time.monotonic()
         live.show(None, 0.3)
         assert live._allowed - before == pytest.approx(0.3 / 0.03, abs=0.5)
-    finally:
-        live.close()
 
 
 def test_a_port_in_use_does_not_end_a_training(tmp_path, capsys):
@@ -131,10 +131,8 @@ def test_a_control_changes_the_picture(studio, browser):
 @needs_chromium
 def test_a_click_on_a_frustum_stands_there(studio, browser):
     visitor = settled(studio)
-    world = studio.page.world
-    start = world.start()
-    middle = world.middle
-    wanted = start.__class__(middle + 2 * (start.position - middle), start.rotation, start.fov)
+    world, start, middle = studio.page.world, studio.page.world.start(), studio.page.world.middle
+    wanted = replace(start, position=middle + 2 * (start.position - middle))
     visitor.go(wanted, 5.0)
     wait_for(lambda: visitor._stance.is_near(wanted, 0.02, 0.01), 60, "the browser's own camera is there")
     settled(studio)
@@ -142,7 +140,7 @@ def test_a_click_on_a_frustum_stands_there(studio, browser):
     focal = 0.5 * camera.image_height / math.tan(camera.fov / 2)
     width = browser.evaluate("document.querySelector('canvas').getBoundingClientRect().width")
     for index in studio.page.frustums.indices:
-        place = stance.rotation.T @ (world.stance(world.poses[index], 1.0).position - stance.position)
+        place = stance.rotation.T @ (world.centres[index] - stance.position)
         x, y = place[:2] / place[2] * focal * width / camera.image_width
         x, y = x + width / 2, y + 360
         if place[2] > 0 and 330 < x < width - 20 and 20 < y < 600:
@@ -210,6 +208,17 @@ def test_walking_is_at_eye_height(studio, browser):
     browser.press("walk")
     wait_for(lambda: visitor.motion == "walk", 60, "the motion is chosen")
     settled(studio)
+    visitor.go(looking(visitor.world.middle + visitor.world.up, visitor.world.middle, visitor.world.up, 0.9))
+
+    def height():
+        down = visitor._sounding(visitor.stance, visitor.version, visitor.settings)
+        depth = drawer.draw(down.look).values
+        known = depth[depth > 0]
+        return np.median(known) / visitor.exhibit.space.unit if len(known) else math.inf
+
+    drawer = Drawer(studio._drawer._subject, studio._drawer._owners)  # its own draws at the same time
+    wanted = EYE_HEIGHT * visitor.exhibit.space.extent
+    wait_for(lambda: height() == pytest.approx(wanted, rel=0.2), 60, "the visitor stands on the ground")
     browser.press("orbit")
     wait_for(lambda: visitor.motion == "orbit", 60, "the motion is chosen")
     settled(studio)
@@ -239,15 +248,12 @@ def test_keys_move_a_visitor_who_flies(studio, browser):
 def test_a_ply_file_behind_a_token(trained, tmp_path):
     file = tmp_path / "model.ply"
     export_ply(open_run(trained[1]).model(), file)
-    studio = Studio(open_model(file, Ranks()), host="0.0.0.0", port=0)
-    try:
+    with contextlib.closing(Studio(open_model(file, Ranks()), host="0.0.0.0", port=0)) as studio:
         url = studio.page.url.replace("0.0.0.0", "127.0.0.1")
         with Browser(url) as browser:
             settled(studio)
             wait_for(lambda: picture(browser).std() > 5, 60, "the picture is on the page")
             assert browser.errors() == []
-    finally:
-        studio.close()
 
 
 @needs_chromium

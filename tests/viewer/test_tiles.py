@@ -15,23 +15,17 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.packed import write_splat
 from blitzgs.formats.ply import save_ply
 from blitzgs.formats.tiles import write_tiles
-from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs.folder import open_run
-from blitzgs.view.draw import Drawer
-from blitzgs.view.look import Look
 from blitzgs.viewer.studio import open_model
 from blitzgs.viewer.web import open_city, to_globe
 from tests.browser import Browser, needs_chromium, wait_for
 from tests.formats.test_tiles import SCENE, city, nodes
 from tests.helpers import read_glb, refused
 from tests.viewer.test_parts import camera_at
+from tests.viewer.test_web import rendered
 
-WIDTH, HEIGHT = 320, 240
+WIDTH, HEIGHT, MIDDLE = 320, 240, (20, 15, 0)
 K = np.array([[280.0, 0, 160], [0, 280, 120], [0, 0, 1]])
-
-
-def pose(eye, target=(20, 15, 0)):
-    return camera_at(eye, target)
 
 
 @pytest.fixture(scope="module")
@@ -62,15 +56,15 @@ def pixels(browser):
 def test_nearer_views_load_more_tiles_and_farther_ones_show_fewer(shown):
     _, browser, url = shown
     browser.go(url)
-    far = settle(browser, pose((20, -1500, 900)))
-    near = settle(browser, pose((20, 4, 5)))
+    far = settle(browser, camera_at((20, -1500, 900), MIDDLE))
+    near = settle(browser, camera_at((20, 4, 5), MIDDLE))
     assert 0 < far["shown"] < near["shown"] and far["gaussians"] < near["gaussians"]
     assert not set(far["uris"]) & set(near["uris"])  # fine tiles replace coarse ones
     assert near["bytes"] >= far["bytes"] > 0  # the page's own first view may have loaded tiles before
     assert pixels(browser).std() > 15
-    again = settle(browser, pose((20, -1500, 900)))
+    again = settle(browser, camera_at((20, -1500, 900), MIDDLE))
     assert sorted(again["uris"]) == sorted(far["uris"]) and again["bytes"] == near["bytes"]
-    away = settle(browser, pose((20, -1500, 900), (20, -3000, 900)))
+    away = settle(browser, camera_at((20, -1500, 900), (20, -3000, 900)))
     assert away["shown"] < far["shown"]  # behind the camera
     assert browser.errors() == []
 
@@ -80,13 +74,12 @@ def test_with_all_tiles_the_picture_is_that_of_our_renderer(shown):
     folder, browser, url = shown
     browser.go(url + "?error=1e-9")
     opened = open_model(folder / "city.ply", Ranks())
-    view = pose((20, -6, 9))
+    view = camera_at((20, -6, 9), MIDDLE)
     state = settle(browser, view)
     space = opened.exhibit.space
     moved = view.copy()
     moved[:3, 3] = (view[:3, 3] + view[:3, :3] @ np.array(space.offset)) / space.unit
-    drawer = Drawer(opened.subject, TileOwners(opened.ranks))
-    wanted = drawer.draw(Look(moved, K, WIDTH, HEIGHT, lod=False)).values.astype(int)
+    wanted = rendered(opened, moved, K, WIDTH, HEIGHT, lod=False)
     assert wanted.std() > 15 and state["gaussians"] > 4000
     assert np.abs(pixels(browser) - wanted).mean() < 1
 
@@ -95,9 +88,9 @@ def test_with_all_tiles_the_picture_is_that_of_our_renderer(shown):
 def test_a_budget_is_kept_and_missing_tiles_are_said(shown):
     folder, browser, url = shown
     browser.go(url + "?budget=28000&error=0.01")
-    first = settle(browser, pose((8, 8, 4), (2, 2, 1)))
+    first = settle(browser, camera_at((8, 8, 4), (2, 2, 1)))
     assert first["shown"] < first["wanted"] <= 7  # pages of 4,096 Gaussians
-    other = settle(browser, pose((32, 22, 4), (38, 28, 1)))
+    other = settle(browser, camera_at((32, 22, 4), (38, 28, 1)))
     assert other["shown"] < other["wanted"] <= 7 and set(other["uris"]) != set(first["uris"])
     assert pixels(browser).std() > 5
     assert browser.errors() == []

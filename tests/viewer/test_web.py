@@ -48,9 +48,15 @@ def write_model(path, comments=(), degree=3, count=3000):
     return open_model(path, Ranks())
 
 
+def show(browser, opened, folder):
+    """Write a model as a page, and open it."""
+    (folder / "m.html").write_text(web_file(opened, 10_000_000).text)
+    browser.go((folder / "m.html").as_uri())
+
+
 def views(opened):
     """Yield viewmat and K: from outside, and from the midst of the Gaussians with an off-centre lens."""
-    world = World(opened.exhibit.space, (), opened.exhibit.box.mean(axis=0))
+    world = World(opened.exhibit.space, (), opened.exhibit.box)
     start = world.start()
     yield world.viewmat(start), intrinsics(WIDTH, HEIGHT, start.fov)
     inside = looking(world.middle + 0.2 * (start.position - world.middle), world.middle, world.up, 1.0)
@@ -83,9 +89,7 @@ def browser():
 )
 def test_the_picture_is_that_of_our_renderer(browser, tmp_path, comments, degree):
     opened = write_model(tmp_path / "m.ply", comments, degree)
-    file = tmp_path / "m.html"
-    file.write_text(web_file(opened, 10_000_000).text)
-    browser.go(file.as_uri())
+    show(browser, opened, tmp_path)
     for pose, K in views(opened):  # noqa: N806
         wanted, found = rendered(opened, pose, K), shown(browser, pose, K)
         assert wanted.std() > 20
@@ -99,9 +103,7 @@ def test_the_picture_is_that_of_our_renderer(browser, tmp_path, comments, degree
 @needs_chromium
 def test_mouse_and_wheel_move_and_reset_goes_back(browser, tmp_path):
     opened = write_model(tmp_path / "m.ply", count=600)
-    file = tmp_path / "m.html"
-    file.write_text(web_file(opened, 10_000_000).text)
-    browser.go(file.as_uri())
+    show(browser, opened, tmp_path)
     assert re.fullmatch(r"5\d\d of 5\d\d Gaussians", browser.evaluate("figures.textContent"))
 
     def picture():
