@@ -15,7 +15,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import Gaussians, is_antialiased
 from blitzgs.formats.models import read_gaussians
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs import run_files
+from blitzgs.runs import run_files, trained_model
 from blitzgs.runs.cameras import input_files, warn_of_changes
 from blitzgs.runs.evaluation import evaluate, load_lpips, worst_views
 from blitzgs.runs.world import check_seen, subject_of_file
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
             if args.downscale is not None:
                 raise ValueError("--downscale is for a file: a run is measured at the size it was trained at")
             run_folder, checkpoint = run_files.run_and_checkpoint(path)
-            model = run_files.open_model(run_folder, ranks, args.data, args.resident_gb, checkpoint)
+            model = trained_model.open_model(run_folder, ranks, args.data, args.resident_gb, checkpoint)
             config = model.config
         if args.allow_missing:
             config = changed(config, "data", allow_missing=True)

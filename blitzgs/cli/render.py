@@ -26,7 +26,7 @@ from blitzgs.cli import arguments
 from blitzgs.cli.arguments import chosen_views
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs import run_files
+from blitzgs.runs import run_files, trained_model
 from blitzgs.runs.cameras import CAMERAS, RunCameras, input_files, load_cameras
 from blitzgs.runs.evaluation import render_view
 from blitzgs.table.table import GaussianTable
@@ -252,7 +252,7 @@ def open_rendered(args: argparse.Namespace, film: Film | None, ranks: Ranks) -> 
         stored, exposures = None, None
     else:
         folder, checkpoint = run_files.run_and_checkpoint(args.model)
-        model = run_files.open_model(folder, ranks, args.data, args.resident_gb, checkpoint)
+        model = trained_model.open_model(folder, ranks, args.data, args.resident_gb, checkpoint)
         exposures = model.exposures
         box = _shared_box(model.table, ranks)
         stored = _stored_cameras(args, folder, model, ranks)
@@ -301,7 +301,7 @@ def _exposures(found: Tensor | None, stored: RunCameras) -> dict[int, Tensor]:
 
 
 def _stored_cameras(
-    args: argparse.Namespace, folder: Path, model: run_files.TrainedModel, ranks: Ranks
+    args: argparse.Namespace, folder: Path, model: trained_model.TrainedModel, ranks: Ranks
 ) -> RunCameras | None:
     """Return the cameras of the given capture; without one, those that the run stored, else its capture's.
 

@@ -25,12 +25,12 @@ from blitzgs.formats.gaussians import MIP, Gaussians, GaussianSource, joined
 from blitzgs.formats.models import Format, check_replaces, offset_of
 from blitzgs.formats.selection import Selected, Selection
 from blitzgs.optim.table_adam import TableAdam
-from blitzgs.runs import checkpoint, run_files
+from blitzgs.runs import checkpoint, run_files, trained_model
 from blitzgs.runs.cameras import SHARED_EXPOSURES
 from blitzgs.runs.checkpoint_files import Shard, opened
 from blitzgs.runs.folder import Model, model_of
-from blitzgs.runs.folder_checks import check_own
-from blitzgs.runs.run_files import Progress, TrainedModel, lod_gate
+from blitzgs.runs.resume import compare_with_file
+from blitzgs.runs.trained_model import Progress, TrainedModel, check_own
 from blitzgs.runs.world import trained_table
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.util.output import write_file
@@ -326,9 +326,9 @@ def open_source(folder: Path, only: str | None = None) -> RunSource:
         raise FileNotFoundError(f"{folder} has no checkpoint yet; let the training finish or save one")
     manifest, path, _ = found
     check_own(folder, path, str(manifest.state.get("run", "")), alone)
-    progress, space, config = run_files.parsed(manifest.state, path)
-    run_files.compare_with_file(config, folder / run_files.CONFIG)
-    gate = lod_gate(config, progress)
+    progress, space, config = trained_model.parsed(manifest.state, path)
+    compare_with_file(config, folder / run_files.CONFIG)
+    gate = progress.lod_gate(config)
     trained = _Shards(path, manifest.shards, config, progress.step, space.extent, gate is not None)
     exposed = False
     if manifest.shared is not None:

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks the folder of a run: ranks can write to it, there is space, no other run uses it or wrote in it."""
+"""Checks the folder of a training: no other one uses it, all ranks can write to it, and there is space."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import fcntl
-import json
 import os
 import secrets
 import shutil
@@ -16,9 +15,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs.cameras import CAMERAS
-from blitzgs.runs.checkpoint import CheckpointError
-from blitzgs.runs.log import LOG, records
 from blitzgs.table.table import GaussianTable
 from blitzgs.util.errors import warn
 from blitzgs.util.terminal import amount
@@ -133,32 +129,3 @@ def check_room(folder: Path, table: GaussianTable, ranks: Ranks, most_gaussians:
         warn(
             f"{folder}: {amount(free)} are free; two checkpoints of {most:,} Gaussians take {amount(wanted)}"
         )
-
-
-def check_own(folder: Path, checkpoint: Path, run_id: str, ranks: Ranks) -> None:
-    """Check that a checkpoint was written by the run whose cameras and log are in `folder`. Collective.
-
-    CheckpointError, on every rank: it was written by another run. Old checkpoints have no id and are not
-    checked.
-    """
-    known = ranks.broadcast_object(known_id(folder) if ranks.rank == 0 else "")
-    if known and run_id and known != run_id:
-        raise CheckpointError(
-            f"{checkpoint} was written by another run ({run_id}) than the one in {folder} ({known}), whose "
-            "cameras would be used with it: put back this run's own checkpoints, or use the folder of the "
-            "other run"
-        )
-
-
-def known_id(folder: Path) -> str:
-    """Return the id of the run in a folder, from its cameras, else from its log; empty if it is not known."""
-    try:
-        found = json.loads((folder / CAMERAS).read_text(encoding="utf-8")).get("run", "")
-    except (OSError, ValueError, AttributeError, RecursionError):
-        found = ""
-    if isinstance(found, str) and found:
-        return found
-    with contextlib.suppress(OSError):
-        found = [record["run"] for record in records(folder / LOG) if isinstance(record.get("run"), str)]
-        return found[-1] if found else ""
-    return ""

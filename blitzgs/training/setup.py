@@ -26,7 +26,8 @@ from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, EXPOSURES, SHARED_EXPOSURES, save_cameras, warn_of_changes
 from blitzgs.runs.folder_checks import check_room, check_writable
 from blitzgs.runs.log import LOG, RunLog
-from blitzgs.runs.run_files import Progress
+from blitzgs.runs.resume import check_resumable, with_pace_of
+from blitzgs.runs.trained_model import Progress, TrainedModel, restore
 from blitzgs.runs.world import check_seen, save_world_frame, trained_columns
 from blitzgs.spawn.gate import lineage_subject, open_spawn_gate
 from blitzgs.spawn.lineage import Ledger, Lineage, initial_births
@@ -84,7 +85,7 @@ def set_up(
     space = Space.of(capture.offset, capture.extent)
     lap("checks")
     home = torch.device("cpu") if config.memory.resident_gb > 0 else ranks.device
-    restored = run_files.restore(folder, ranks, home) if resume else None
+    restored = restore(folder, ranks, home) if resume else None
     config = _continued(_resolved(config, capture, restored), restored, extend, folder)
     schedule = Schedule(config.schedule)
     if restored is None:
@@ -179,13 +180,13 @@ def _describe(folder: Path, config: Config, capture: Capture, run_id: str, is_ne
         save_world_frame(folder, capture.about.frame)
 
 
-def _resolved(config: Config, capture: Capture, restored: run_files.TrainedModel | None) -> Config:
+def _resolved(config: Config, capture: Capture, restored: TrainedModel | None) -> Config:
     """Return `config` with the values that depend on the training views and on what the run has measured.
 
     The depths of what the views see decide on the near plane (`model.near`). The number of views decides the
     length of the run (`schedule.images_per_view`) and the opacity term (`loss.opacity_total`). A run that is
     resumed with fewer or more photographs (`data.allow_missing`) keeps the values that it began with.
-    `run_files.with_pace_of` says what a run measures.
+    `with_pace_of` says what a run measures.
     """
     schedule, loss = config.schedule, config.loss
     if restored is not None:
@@ -202,12 +203,10 @@ def _resolved(config: Config, capture: Capture, restored: run_files.TrainedModel
         model = replace(model, near=near)
     views = len(capture.train)
     config = replace(config, model=model, schedule=stretched(schedule, views), loss=weighted(loss, views))
-    return run_files.with_pace_of(config, None if restored is None else restored.config)
+    return with_pace_of(config, None if restored is None else restored.config)
 
 
-def _continued(
-    config: Config, restored: run_files.TrainedModel | None, extend: float | None, folder: Path
-) -> Config:
+def _continued(config: Config, restored: TrainedModel | None, extend: float | None, folder: Path) -> Config:
     """Return the configuration to begin or continue a run with: `config`, or one with a longer schedule."""
     if restored is None:
         if extend is not None:
@@ -216,11 +215,11 @@ def _continued(
     if extend is not None:
         # An interrupted extension may have left its schedule in the folder's configuration.
         config = replace(config, schedule=restored.config.schedule)
-    run_files.check_resumable(restored.config, config)
+    check_resumable(restored.config, config)
     return config if extend is None else extended(config, restored.progress.step, extend)
 
 
-def _tile_owners(ranks: Ranks, progress: Progress, restored: run_files.TrainedModel | None) -> TileOwners:
+def _tile_owners(ranks: Ranks, progress: Progress, restored: TrainedModel | None) -> TileOwners:
     """Return the division of tiles, with the costs that the checkpoint has if they can be used."""
     owners = TileOwners(ranks)
     if restored is None or "bounds" not in restored.shared or ranks.world_size == 1:
@@ -236,7 +235,7 @@ def _exposures(
     images: ImageStore,
     ranks: Ranks,
     progress: Progress,
-    restored: run_files.TrainedModel | None,
+    restored: TrainedModel | None,
 ) -> Exposures | None:
     """Return the photographs' exposures, from the checkpoint or the tracks; None if they are equal."""
     exposures = Exposures(capture.train, ranks)
@@ -296,7 +295,7 @@ def _start_lineage(
     return lineage
 
 
-def _origin(restored: run_files.TrainedModel | None, resume: bool, folder: Path, schedule: Schedule) -> str:
+def _origin(restored: TrainedModel | None, resume: bool, folder: Path, schedule: Schedule) -> str:
     """Describe where the run begins, for the log."""
     if restored is not None:
         more = ""

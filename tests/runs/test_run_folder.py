@@ -18,8 +18,9 @@ import blitzgs
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply
-from blitzgs.runs import checkpoint, run_files
+from blitzgs.runs import checkpoint, trained_model
 from blitzgs.runs.export import without_antialiasing
+from blitzgs.runs.resume import check_resumable
 from blitzgs.training.trainer import Trainer
 from tests.helpers import export_ply, refused, save_checkpoint
 from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene
@@ -267,9 +268,9 @@ def test_eval_uses_the_configuration_of_the_checkpoint(copy, tmp_path, capsys, c
 
 
 def test_what_a_resume_may_change(trained):
-    saved = run_files.restore(trained[1], Ranks()).config
+    saved = trained_model.restore(trained[1], Ranks()).config
     schedule = dataclasses.replace(saved.schedule, evaluate_every=7, checkpoint_every=9)
-    run_files.check_resumable(saved, dataclasses.replace(saved, schedule=schedule))
+    check_resumable(saved, dataclasses.replace(saved, schedule=schedule))
 
 
 @pytest.mark.parametrize(
@@ -277,7 +278,7 @@ def test_what_a_resume_may_change(trained):
 )
 def test_a_checkpoint_of_another_version_is_named(trained, tmp_path, failure, state):
     shutil.copy(trained[1] / "config.yaml", tmp_path)
-    table = run_files.restore(trained[1], Ranks()).table
+    table = trained_model.restore(trained[1], Ranks()).table
     save_checkpoint(tmp_path / "checkpoints", {name: table[name] for name in table}, state, Ranks())
     assert "checkpoint_000000 belongs to another version of BlitzGS" in failure("eval", tmp_path)
 
