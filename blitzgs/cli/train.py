@@ -27,7 +27,9 @@ from blitzgs.config.ranges import describe, describe_all, describe_page
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import run_files
 from blitzgs.runs.folder_checks import locked
+from blitzgs.runs.resume import check_before_capture
 from blitzgs.sfm.refine import fit_of
+from blitzgs.spawn.gate import RANDOM, SpawnGate, gate_file
 from blitzgs.training.budget import LEAST_IMAGES, estimate
 from blitzgs.training.inputs import open_capture, read_ahead
 from blitzgs.training.setup import check_unclaimed
@@ -169,6 +171,8 @@ def run(args: argparse.Namespace) -> int:
         return _check(args, config)
     # Before the photographs, which take long.
     check_unclaimed(args.out, args.resume)
+    if (gate := config.population.gate) is not None and gate != RANDOM:
+        SpawnGate(gate_file(gate))
     if config.model.start and not args.resume and not Path(config.model.start).exists():
         raise FileNotFoundError(f"{config.model.start}: there is no such file of Gaussians (--start)")
     if (photographs := Path(config.data.path) / config.data.images).is_dir():
@@ -180,6 +184,8 @@ def run(args: argparse.Namespace) -> int:
         if posed is not config:
             laps.lap("poses")
         config = posed
+    if args.resume:
+        check_before_capture(args.out, config, args.extend is not None)
     with (
         kept_warnings() as warned,
         nullcontext(read_ahead(config.data)) as reading,  # while the ranks join

@@ -51,13 +51,14 @@ class Manifest:
 
 def verified(path: Path, part: int = 0, parts: int = 1) -> Manifest:
     """Read the manifest of a checkpoint, and compare part of the files with their digests; see `DAMAGE`."""
-    manifest = _read_manifest(path)
+    manifest = read_manifest(path)
     for shard in [*manifest.shards, *([manifest.shared] if manifest.shared else [])][part::parts]:
         _verify(path, shard)
     return manifest
 
 
-def _read_manifest(path: Path) -> Manifest:
+def read_manifest(path: Path) -> Manifest:
+    """Read the manifest of a checkpoint, whose files may be damaged; see `DAMAGE`."""
     try:
         content = json.loads((path / MANIFEST).read_text())
     except FileNotFoundError:

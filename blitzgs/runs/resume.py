@@ -3,12 +3,16 @@
 
 from __future__ import annotations
 
-import dataclasses
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from blitzgs.config.fields import Config
-from blitzgs.config.files import ConfigError, flat, load_config, to_dict
+from blitzgs.config.files import ConfigError, flat, from_dict, load_config, to_dict
+from blitzgs.runs.checkpoint import names_of
+from blitzgs.runs.checkpoint_files import DAMAGE, read_manifest
+from blitzgs.runs.run_files import CHECKPOINTS
 from blitzgs.util.errors import warn
 
 # Sections and fields that a resumed run may change, because they do not change the result beyond rounding.
@@ -53,6 +57,41 @@ def check_resumable(saved: Config, wanted: Config) -> None:
             )
 
 
+def check_before_capture(folder: Path, wanted: Config, extends: bool) -> None:
+    """Refuse, before the capture is read, what a run that goes on in `folder` would refuse afterwards.
+
+    FileNotFoundError: a run that `extends` has no checkpoint. ConfigError: as `check_resumable`, but for what
+    `wanted` leaves to the capture.
+    """
+    names = names_of(folder / CHECKPOINTS)
+    if extends and not names:
+        raise FileNotFoundError(f"{folder} has no checkpoint: there is no finished run to extend")
+    for name in reversed(names):
+        with suppress(*DAMAGE):
+            saved = from_dict(read_manifest(folder / CHECKPOINTS / name).state["config"])
+            break
+    else:
+        return  # the checkpoints are damaged, which is said when one is read
+    if extends:
+        wanted = replace(wanted, schedule=saved.schedule)
+    check_resumable(saved, with_pace_of(decided_as(saved, wanted), saved))
+
+
+def decided_as(saved: Config, wanted: Config) -> Config:
+    """Return `wanted` with the saved values of what it leaves to the capture.
+
+    These are the near plane, and what follows from the number of views: length and opacity term.
+    """
+    schedule, loss, model = wanted.schedule, wanted.loss, wanted.model
+    if schedule.images_per_view > 0:
+        schedule = replace(schedule, scale=saved.schedule.scale, images_per_view=0.0)
+    if loss.opacity_total > 0:
+        loss = replace(loss, opacity=saved.loss.opacity, opacity_total=0.0)
+    if model.near == 0:
+        model = replace(model, near=saved.model.near)
+    return replace(wanted, schedule=schedule, loss=loss, model=model)
+
+
 def with_pace_of(config: Config, saved: Config | None) -> Config:
     """Return `config` with the pace of the checkpoint's configuration, `saved`.
 
@@ -62,8 +101,8 @@ def with_pace_of(config: Config, saved: Config | None) -> Config:
     """
     schedule = config.schedule
     if schedule.minutes > 0:
-        schedule = dataclasses.replace(schedule, pace=() if saved is None else saved.schedule.pace)
-    return dataclasses.replace(config, schedule=schedule)
+        schedule = replace(schedule, pace=() if saved is None else saved.schedule.pace)
+    return replace(config, schedule=schedule)
 
 
 def _is_free(name: str) -> bool:

@@ -26,7 +26,7 @@ from blitzgs.runs import run_files
 from blitzgs.runs.cameras import CAMERAS, EXPOSURES, SHARED_EXPOSURES, save_cameras, warn_of_changes
 from blitzgs.runs.folder_checks import check_room, check_writable
 from blitzgs.runs.log import LOG, RunLog
-from blitzgs.runs.resume import check_resumable, with_pace_of
+from blitzgs.runs.resume import check_resumable, decided_as, with_pace_of
 from blitzgs.runs.trained_model import Progress, TrainedModel, restore
 from blitzgs.runs.world import check_seen, save_world_frame, trained_columns
 from blitzgs.spawn.gate import lineage_subject, open_spawn_gate
@@ -188,22 +188,15 @@ def _resolved(config: Config, capture: Capture, restored: TrainedModel | None) -
     resumed with fewer or more photographs (`data.allow_missing`) keeps the values that it began with.
     `with_pace_of` says what a run measures.
     """
-    schedule, loss = config.schedule, config.loss
-    if restored is not None:
-        known, own = restored.progress.train_views, restored.config
-        if known not in ("", train_views_fingerprint(capture)):
-            if schedule.images_per_view > 0:
-                schedule = replace(schedule, scale=own.schedule.scale, images_per_view=0.0)
-            if loss.opacity_total > 0:
-                loss = replace(loss, opacity=own.loss.opacity, opacity_total=0.0)
-    model = config.model
+    saved = None if restored is None else restored.config
+    if restored is not None and restored.progress.train_views not in ("", train_views_fingerprint(capture)):
+        config = decided_as(restored.config, config)
+    model, views = config.model, len(capture.train)
     if model.near == 0:
         # Relative to the extent of this capture: a photograph that is lost later does not move the plane.
-        near = capture.near / capture.extent if restored is None else restored.config.model.near
-        model = replace(model, near=near)
-    views = len(capture.train)
-    config = replace(config, model=model, schedule=stretched(schedule, views), loss=weighted(loss, views))
-    return with_pace_of(config, None if restored is None else restored.config)
+        model = replace(model, near=capture.near / capture.extent if saved is None else saved.model.near)
+    schedule, loss = stretched(config.schedule, views), weighted(config.loss, views)
+    return with_pace_of(replace(config, model=model, schedule=schedule, loss=loss), saved)
 
 
 def _continued(config: Config, restored: TrainedModel | None, extend: float | None, folder: Path) -> Config:

@@ -274,6 +274,25 @@ def test_what_a_resume_may_change(trained):
 
 
 @pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--resume", "--loss.ssim=0.3"], "loss.ssim: the checkpoint was trained with 0.2, now 0.3"),
+        (["--extend=1.5", "--loss.ssim=0.3"], "loss.ssim: the checkpoint was trained with 0.2, now 0.3"),
+        (["--resume", "--population.gate=no.json"], "no.json: no such gate; `blitzgs gate fit` makes one"),
+        # What the capture decides is compared when it is known.
+        (["--resume", "--model.near=0", "--schedule.images_per_view=9", "--loss.opacity_total=1"], "nowhere"),
+    ],
+)
+def test_a_run_is_refused_before_its_capture_is_read(trained, tmp_path, failure, flags, message):
+    assert message in failure("train", "--out", trained[1], "--data", tmp_path / "nowhere", *flags)
+
+
+def test_nothing_is_extended_before_the_capture_is_read(tmp_path, failure):
+    flags = ("--config=defaults", "--extend=1.5", "--data", tmp_path / "nowhere")
+    assert "there is no finished run to extend" in failure("train", "--out", tmp_path / "run", *flags)
+
+
+@pytest.mark.parametrize(
     "state", [{}, {"progress": {"steps": 1}}, {"progress": [], "space": {"offset": 3}, "config": {}}]
 )
 def test_a_checkpoint_of_another_version_is_named(trained, tmp_path, failure, state):

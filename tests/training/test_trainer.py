@@ -79,7 +79,7 @@ def test_resume_is_exact(whole_run, tmp_path, monkeypatch):
     The first 50 are those of an earlier version, whose configuration has fields that are gone.
     """
     _, whole, _ = whole_run
-    for module in ("blitzgs.config.files", "blitzgs.runs.run_files"):
+    for module in ("blitzgs.config.files", "blitzgs.runs.trained_model"):
         monkeypatch.setattr(f"{module}.to_dict", _of_an_earlier_version)
     stop_at(monkeypatch, 50)
     first, summary = train(tmp_path)
