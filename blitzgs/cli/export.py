@@ -27,16 +27,14 @@ from blitzgs.runs.clean import cleaned
 from blitzgs.runs.export import (
     COORDINATES,
     Exported,
-    Watched,
     export,
     export_file,
     export_folder,
-    open_source,
-    source_of,
     without_antialiasing,
 )
 from blitzgs.runs.folder import Model, open_run, subject_of
 from blitzgs.runs.run_files import run_and_checkpoint
+from blitzgs.runs.source import Watched, open_source, source_of
 from blitzgs.runs.world import in_world, load_world_frame
 from blitzgs.util.output import write_file
 from blitzgs.util.progress import ending_by_exception, image_progress
