@@ -103,10 +103,8 @@ def examine(folder: Path | None = None) -> list[Line]:
     lines = [Line("blitzgs", "ok", f"{__version__} in {_PACKAGE}"), _system(), _memory(), *_packages()]
     torch_line = _torch()
     gpus = torch_line.values.get("gpus", [])
-    lines += [
-        torch_line,
-        _looked("driver", "restart the machine, or install the driver again", False, _driver),
-    ]
+    driver = _looked("driver", "restart the machine, or install the driver again", False, _driver)
+    lines += [torch_line, driver]
     lines += [*(_gpu(number, gpu) for number, gpu in enumerate(gpus)), _looked("nvcc", "", False, _nvcc)]
     works = torch_line.state in ("ok", "warning")
     checks: list[tuple[str, str, bool, Callable[[], Line]]] = []
@@ -149,39 +147,26 @@ def probe(name: str, *arguments: str) -> dict[str, Any]:
 
 
 def run_command(command: Sequence[str]) -> str:
-    """Run a command, with all processes that it starts, and return its standard output.
+    """Run a command and return its standard output.
 
     ProbeError: it cannot be started, failed, was killed or took longer than `TIMEOUT`.
     """
     path = os.pathsep.join(filter(None, [str(_PACKAGE.parent), os.environ.get("PYTHONPATH")]))
+    environment = os.environ | {"PYTHONPATH": path}
     try:
-        process = subprocess.Popen(
-            command,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            errors="replace",
-            env=os.environ | {"PYTHONPATH": path},
-            start_new_session=True,
+        done = subprocess.run(
+            command, capture_output=True, text=True, errors="replace", env=environment, timeout=TIMEOUT
         )
     except OSError as error:
         raise ProbeError(f"{command[0]}: {error.strerror}") from error
-    try:
-        output, errors = process.communicate(timeout=TIMEOUT)
     except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
         raise ProbeError(f"no answer within {TIMEOUT:g} s") from None
-    if process.returncode < 0:
-        raise ProbeError(f"ended by {signal.Signals(-process.returncode).name}: {_last(errors)}")
-    if process.returncode:
-        raise ProbeError(_last(errors) or f"exit status {process.returncode}")
-    return output
-
-
-def _last(errors: str) -> str:
-    lines = [line.strip() for line in errors.splitlines() if line.strip()]
-    return lines[-1][:300] if lines else ""
+    last = done.stderr.strip().rpartition("\n")[2].strip()[:300]
+    if done.returncode < 0:
+        raise ProbeError(f"ended by {signal.Signals(-done.returncode).name}: {last}")
+    if done.returncode:
+        raise ProbeError(last or f"exit status {done.returncode}")
+    return done.stdout
 
 
 def _system() -> Line:
@@ -208,9 +193,7 @@ def _memory() -> Line:
 
 def _packages() -> list[Line]:
     """Return a line for each package that BlitzGS needs (but torch), and for each of the extras."""
-    try:
-        wanted = metadata.requires("blitzgs") or []
-    except metadata.PackageNotFoundError:
+    if not (wanted := _requirements()):
         return [Line("packages", "warning", "blitzgs is not installed as a package", "pip install .", False)]
     lines = []
     for requirement in wanted:
@@ -227,18 +210,12 @@ def _packages() -> list[Line]:
     return lines
 
 
-def _torch_bounds() -> dict[str, str]:
-    """Return the lowest torch that BlitzGS works with (">="), and the first that is not tested ("<").
-
-    A bound that the installed package does not state is absent.
-    """
+def _requirements() -> list[str]:
+    """Return what the installed package requires; empty: there is none."""
     try:
-        wanted = metadata.requires("blitzgs") or []
+        return metadata.requires("blitzgs") or []
     except metadata.PackageNotFoundError:
-        wanted = []
-    torch = next((text for text in wanted if re.match(r"torch\b", text)), "")
-    found = dict(re.findall(r"(>=|<)\s*([\d.]+)", torch))
-    return {sign: found[sign] for sign in (">=", "<") if sign in found}
+        return []
 
 
 def _version(text: str) -> tuple[int, ...]:
@@ -246,7 +223,9 @@ def _version(text: str) -> tuple[int, ...]:
 
 
 def _torch() -> Line:
-    bounds = _torch_bounds()
+    # The lowest that works, and the first that is not tested, where the installed package states them.
+    wanted = next((text for text in _requirements() if re.match(r"torch\b", text)), "")
+    bounds = dict(sorted(re.findall(r"(>=|<)\s*([\d.]+)", wanted), reverse=True))
     limits = ",".join(f"{sign}{version}" for sign, version in bounds.items())
     install = f"pip install 'torch{limits}'" if bounds else "pip install torch"
     try:

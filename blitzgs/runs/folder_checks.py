@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import os
 import secrets
 import shutil
@@ -16,6 +15,7 @@ from pathlib import Path
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.table.table import GaussianTable
+from blitzgs.util import output
 from blitzgs.util.errors import warn
 from blitzgs.util.terminal import amount
 
@@ -36,49 +36,42 @@ def locked(folder: Path, ranks: Ranks) -> Iterator[None]:
     The operating system releases the lock when the process ends, also after a crash. FolderError, on every
     rank: another process is training in the folder.
     """
-    descriptor, problem = None, None
-    if ranks.rank == 0:
-        folder.mkdir(parents=True, exist_ok=True)
-        descriptor, problem = _lock(folder / LOCK)
-    problem = ranks.broadcast_object(problem)
-    try:
-        if problem is not None:
+    with contextlib.ExitStack() as stack:
+        problem = None
+        if ranks.rank == 0:
+            folder.mkdir(parents=True, exist_ok=True)
+            problem = _lock(folder / LOCK, stack)
+        if (problem := ranks.broadcast_object(problem)) is not None:
             raise FolderError(problem)
         yield
-    finally:
-        if descriptor is not None:
-            os.close(descriptor)
 
 
-def _lock(path: Path) -> tuple[int | None, str | None]:
-    """Return the descriptor that holds the lock, or why there is none."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+def _lock(path: Path, stack: contextlib.ExitStack) -> str | None:
+    """Hold a lock until the stack ends; returns why it cannot be had; None, also where there are none."""
     deadline = time.monotonic() + LOCK_SECONDS
     while True:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            descriptor = stack.enter_context(output.locked(path))
             break
         except BlockingIOError:
             if time.monotonic() > deadline:
-                holder = os.pread(descriptor, 200, 0).decode(errors="replace").strip()
-                os.close(descriptor)
-                return None, (
-                    f"{path.parent} is in use by another run ({holder or 'of unknown name'}): wait for it, "
-                    "stop it, or choose another --out"
+                holder = path.read_text(errors="replace").strip() or "of unknown name"
+                return (
+                    f"{path.parent} is in use by another run ({holder}): wait for it, stop it, or choose "
+                    "another --out"
                 )
             time.sleep(0.1)
         except OSError as error:
             if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
                 raise
-            os.close(descriptor)
             warn(
                 f"{path.parent} is on a file system without locks ({error.strerror}): nothing keeps a second "
                 "run out of it"
             )
-            return None, None
+            return None
     os.ftruncate(descriptor, 0)
     os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
-    return descriptor, None
+    return None
 
 
 def check_writable(folder: Path, ranks: Ranks) -> None:
