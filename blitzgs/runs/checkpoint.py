@@ -220,29 +220,21 @@ def sound_manifest(path: Path, ranks: Ranks) -> Manifest:
     return manifest
 
 
-def load(
-    path: Path,
-    ranks: Ranks,
-    device: torch.device | str,
-    problem: Callable[[dict[str, Tensor]], str | None] = lambda columns: None,
-) -> Loaded:
+def load(path: Path, ranks: Ranks, device: torch.device | str) -> Loaded:
     """Load this rank's share of one checkpoint. Collective.
 
     With the world size that it was saved with, each rank gets its own shard unchanged. With another one the
     rows are redistributed: rank m gets the positions = m (mod M) of the global order
-    (`sharding.global_positions`), and opens only the files that hold some of these rows.
+    (`redistribution.global_positions`), and opens only the files that hold some of these rows.
 
-    `path`: folder returned by `Saving.finish`. `problem`: returns what is wrong with a shard's columns, or
-    None. CheckpointError: on every rank, when a file is missing, torn or altered, or a shard has a problem.
+    `path`: folder returned by `Saving.finish`. CheckpointError: on every rank, when a file is missing, torn
+    or altered.
     """
     manifest, shared = sound_manifest(path, ranks), {}
     if manifest.shared is not None:
         with opened(path / manifest.shared.file) as file:
             shared = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    columns = read_share(path, manifest.shards, ranks, torch.device(device))
-    if wrong := [text for text in ranks.all_gather_object(problem(columns)) if text]:
-        raise CheckpointError(f"checkpoint {path} is refused: {'; '.join(wrong)}")
-    return Loaded(columns, manifest.state, shared)
+    return Loaded(read_share(path, manifest.shards, ranks, torch.device(device)), manifest.state, shared)
 
 
 def read_share(path: Path, shards: list[Shard], ranks: Ranks, device: torch.device) -> dict[str, Tensor]:

@@ -25,7 +25,7 @@ from blitzgs.runs.checkpoint_files import Shard, opened
 from blitzgs.runs.folder import Model, model_of
 from blitzgs.runs.resume import compare_with_file
 from blitzgs.runs.run_files import CHECKPOINTS, CONFIG, check_is_run
-from blitzgs.runs.trained_model import Progress, TrainedModel, check_own, parsed
+from blitzgs.runs.trained_model import Progress, TrainedModel, parsed
 from blitzgs.runs.world import trained_table
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.util.progress import Report
@@ -123,8 +123,7 @@ def open_source(folder: Path, only: str | None = None) -> RunSource:
     if found is None:
         raise FileNotFoundError(f"{folder} has no checkpoint yet; let the training finish or save one")
     manifest, path, _ = found
-    check_own(folder, path, str(manifest.state.get("run", "")), alone)
-    progress, space, config = parsed(manifest.state, path)
+    progress, space, config = parsed(manifest.state, path, folder, alone)
     compare_with_file(config, folder / CONFIG)
     gate = progress.lod_gate(config)
     trained = _Shards(path, manifest.shards, config, progress.step, space.extent, gate is not None)

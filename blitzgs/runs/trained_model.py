@@ -175,18 +175,19 @@ def restore(
     """
 
     def load(path: Path) -> checkpoint.Loaded:
-        return checkpoint.load(
-            path, ranks, device or ranks.device, lambda columns: bad_column(GaussianTable(columns))
-        )
+        loaded = checkpoint.load(path, ranks, device or ranks.device)
+        found = ranks.all_gather_object(bad_column(GaussianTable(loaded.columns)))
+        if wrong := [text for text in found if text]:
+            raise CheckpointError(f"checkpoint {path} is refused: {'; '.join(wrong)}")
+        return loaded
 
     found = checkpoint.newest(folder / CHECKPOINTS, ranks, load, only)
     if found is None:
         return None
     loaded, path, refused = found
     state = loaded.state
-    check_own(folder, path, str(state.get("run", "")), ranks)
     why = f"the newest sound one; {len(refused)} newer refused" if refused else "the newest"
-    progress, space, config = parsed(state, path)
+    progress, space, config = parsed(state, path, folder, ranks)
     table = GaussianTable(loaded.columns)
     if len(list(path.glob("shard_*"))) != ranks.world_size:
         # Each rank had an order of its own, and the spread is of another number of blocks.
@@ -196,30 +197,28 @@ def restore(
     return TrainedModel(config, progress, space, table, state.get("run", ""), source, loaded.shared)
 
 
-def parsed(state: Mapping[str, Any], path: Path) -> tuple[Progress, Space, Config]:
-    """Return what the state of a checkpoint says (CheckpointError: it is that of another version)."""
+def parsed(
+    state: Mapping[str, Any], path: Path, folder: Path, ranks: Ranks
+) -> tuple[Progress, Space, Config]:
+    """Return what the state of the checkpoint `path` says. Collective.
+
+    CheckpointError, on every rank: it was written by another version, or by another run than the one whose
+    cameras and log are in `folder`. Old checkpoints have no id and are not compared.
+    """
+    known = ranks.broadcast_object(known_id(folder) if ranks.rank == 0 else "")
+    run_id = str(state.get("run", ""))
+    if known and run_id and known != run_id:
+        raise CheckpointError(
+            f"{path} was written by another run ({run_id}) than the one in {folder} ({known}), whose cameras "
+            "would be used with it: put back this run's own checkpoints, or use the folder of the other run"
+        )
     try:
-        known = {field.name for field in dataclasses.fields(Progress)}
-        progress = Progress(**{name: value for name, value in state["progress"].items() if name in known})
+        fields = {field.name for field in dataclasses.fields(Progress)}
+        progress = Progress(**{name: value for name, value in state["progress"].items() if name in fields})
         space = Space(**(state["space"] | {"offset": tuple(state["space"]["offset"])}))
         return progress, space, from_dict(state["config"])
     except (LookupError, TypeError, AttributeError, ConfigError) as error:
         raise CheckpointError(f"checkpoint {path} belongs to another version of BlitzGS: {error}") from error
-
-
-def check_own(folder: Path, checkpoint: Path, run_id: str, ranks: Ranks) -> None:
-    """Check that a checkpoint was written by the run whose cameras and log are in `folder`. Collective.
-
-    CheckpointError, on every rank: it was written by another run. Old checkpoints have no id and are not
-    checked.
-    """
-    known = ranks.broadcast_object(known_id(folder) if ranks.rank == 0 else "")
-    if known and run_id and known != run_id:
-        raise CheckpointError(
-            f"{checkpoint} was written by another run ({run_id}) than the one in {folder} ({known}), whose "
-            "cameras would be used with it: put back this run's own checkpoints, or use the folder of the "
-            "other run"
-        )
 
 
 def known_id(folder: Path) -> str:
