@@ -11,7 +11,7 @@ from typing import Any
 
 from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_flags, add_path
 from blitzgs.config.fields import ScheduleConfig
-from blitzgs.config.files import ConfigError, changed, load_config
+from blitzgs.config.files import changed
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import run_files
@@ -122,7 +122,7 @@ def run_evaluate(args: argparse.Namespace) -> int:
     figures = args.out / "evaluation.json"
     output.check(figures)
     args.out.mkdir(parents=True, exist_ok=True)
-    schedules = [load_config(folder / run_files.CONFIG).schedule for folder in args.runs]
+    schedules = [open_run(folder).config().schedule for folder in args.runs]
     gate_from = [Schedule(schedule).pace.image(schedule.gate_from) for schedule in schedules]
     results = gate_fit.evaluate(gate, runs, gate_from, output)
     output.write(figures, (json.dumps(results, indent=1) + "\n").encode())
@@ -140,9 +140,7 @@ def run_replay(args: argparse.Namespace) -> int:
     if not 0 <= args.rate <= 1:
         raise ValueError(f"--rate: must be in [0, 1], got {args.rate}")
     gate = SpawnGate(args.gate)
-    if not (args.folder / run_files.CONFIG).exists():
-        raise ConfigError(f"{args.folder} is not a run: it has no {run_files.CONFIG}")
-    config = load_config(args.folder / run_files.CONFIG)
+    config = open_run(args.folder).config()
     if args.data is not None:
         config = changed(config, "data", path=str(args.data))
     results: list[dict[str, Any]] = []

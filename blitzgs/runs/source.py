@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
+from torch import Tensor
 
 from blitzgs.config.fields import Config
 from blitzgs.config.schedule import Schedule
@@ -48,7 +47,7 @@ class Changed:
     def blocks(self) -> Iterator[Gaussians]:
         """Yield all Gaussians, changed."""
         for block in self._source.blocks():
-            yield dataclasses.replace(self._change(block), comments=self.comments)
+            yield replace(self._change(block), comments=self.comments)
 
 
 class Watched(Changed):
@@ -67,32 +66,60 @@ class Watched(Changed):
             self._report(done, len(self))
 
 
-class RunSource(Changed):
-    """The Gaussians of a run; the unit is a power of two, so that positions keep their bits."""
-
-    def __init__(
-        self,
-        trained: GaussianSource,
-        space: Space,
-        comments: list[str],
-        config: Config,
-        progress: Progress | None = None,
-    ) -> None:
-        self.space, self.config, self.progress = space, config, progress
-        super().__init__(trained, self._scaled, comments)
-
-    def _scaled(self, block: Gaussians) -> Gaussians:
-        unit = self.space.unit
-        return dataclasses.replace(block, means=block.means * unit, scales=block.scales + math.log(unit))
-
-
-def source_of(model: Model) -> RunSource:
-    """Return the source of a model in memory."""
-    columns: dict[str, Any] = {name: getattr(model, name).cpu() for name in PARAMETERS}
-    found = Gaussians(**columns, levels=None if model.lod is None else model.level.cpu().float())
+def source_of(model: Model) -> Gaussians:
+    """Return the Gaussians of a model in memory."""
     gate = None if model.lod is None else model.lod.gate
     lines = _comments(model.config, model.space, gate, model.exposures is not None)
-    return RunSource(found, model.space, lines, model.config)
+    columns = {name: getattr(model, name).cpu() for name in (*PARAMETERS, "level")}
+    return _in_unit(columns, model.space, gate is not None, lines)
+
+
+@dataclass(frozen=True)
+class RunSource:
+    """The Gaussians of a checkpoint, a `GaussianSource`: shard after shard, without pending steps."""
+
+    path: Path  # folder of the checkpoint
+    shards: list[Shard]
+    progress: Progress
+    space: Space
+    config: Config
+    comments: list[str]  # header lines
+
+    def __len__(self) -> int:
+        return sum(shard.rows for shard in self.shards)
+
+    @property
+    def degree(self) -> int:
+        """The spherical-harmonics degree."""
+        with opened(self.path / self.shards[0].file) as file:
+            return math.isqrt(file.get_slice("sh").get_shape()[1]) - 1
+
+    @property
+    def has_levels(self) -> bool:
+        """Whether the Gaussians have octree levels."""
+        return self.progress.lod_gate(self.config) is not None
+
+    def blocks(self) -> Iterator[Gaussians]:
+        """Yield all Gaussians."""
+        schedule = Schedule(self.config.schedule)
+        optimiser = TableAdam(self.config.optimiser, schedule, self.space.extent, "cpu")
+        for shard in self.shards:
+            for first in range(0, shard.rows, gaussians.BLOCK):
+                last = min(first + gaussians.BLOCK, shard.rows)
+                with opened(self.path / shard.file) as file:
+                    rows = {name: file.get_slice(name)[first:last] for name in file.keys()}  # noqa: SIM118
+                table = GaussianTable(rows)
+                with torch.no_grad():
+                    optimiser.catch_up(table, None, self.progress.step)
+                yield _in_unit(table.columns, self.space, self.has_levels, self.comments)
+
+
+def _in_unit(columns: Mapping[str, Tensor], space: Space, has_levels: bool, comments: list[str]) -> Gaussians:
+    """Return trained Gaussians in the capture's unit, a power of two, so that positions keep their bits."""
+    values = {name: columns[name] for name in PARAMETERS}
+    values["means"], values["scales"] = values["means"] * space.unit, values["scales"] + math.log(space.unit)
+    levels = columns["level"].float() if has_levels else None
+    return Gaussians(**values, levels=levels, comments=comments)
 
 
 def largest_of_run(source: RunSource, most: int, device: torch.device) -> Model:
@@ -100,7 +127,6 @@ def largest_of_run(source: RunSource, most: int, device: torch.device) -> Model:
 
     It has no SH beyond the DC. Memory holds no others.
     """
-    assert source.progress is not None
     chosen = joined(list(Selected(source, Selection(most=most, sh_degree=0)).blocks()))
     x, y, z = source.space.offset
     found = replace(chosen, comments=[f"comment offset {x!r} {y!r} {z!r}"])
@@ -125,47 +151,12 @@ def open_source(folder: Path, only: str | None = None) -> RunSource:
     manifest, path, _ = found
     progress, space, config = parsed(manifest.state, path, folder, alone)
     compare_with_file(config, folder / CONFIG)
-    gate = progress.lod_gate(config)
-    trained = _Shards(path, manifest.shards, config, progress.step, space.extent, gate is not None)
     exposed = False
     if manifest.shared is not None:
         with opened(path / manifest.shared.file) as shared:
             exposed = SHARED_EXPOSURES in shared.keys()  # noqa: SIM118
-    return RunSource(trained, space, _comments(config, space, gate, exposed), config, progress)
-
-
-@dataclass
-class _Shards:
-    """The Gaussians of a checkpoint in the trained world, shard after shard, without pending steps."""
-
-    path: Path
-    shards: list[Shard]
-    config: Config
-    step: int
-    extent: float
-    has_levels: bool
-    comments: list[str] = field(default_factory=list)
-
-    def __len__(self) -> int:
-        return sum(shard.rows for shard in self.shards)
-
-    @property
-    def degree(self) -> int:
-        with opened(self.path / self.shards[0].file) as file:
-            return math.isqrt(file.get_slice("sh").get_shape()[1]) - 1
-
-    def blocks(self) -> Iterator[Gaussians]:
-        optimiser = TableAdam(self.config.optimiser, Schedule(self.config.schedule), self.extent, "cpu")
-        for shard in self.shards:
-            for first in range(0, shard.rows, gaussians.BLOCK):
-                last = min(first + gaussians.BLOCK, shard.rows)
-                with opened(self.path / shard.file) as file:
-                    rows = {name: file.get_slice(name)[first:last] for name in file.keys()}  # noqa: SIM118
-                table = GaussianTable(rows)
-                with torch.no_grad():
-                    optimiser.catch_up(table, None, self.step)
-                columns: dict[str, Any] = {name: table[name] for name in PARAMETERS}
-                yield Gaussians(**columns, levels=table["level"].float() if self.has_levels else None)
+    lines = _comments(config, space, progress.lod_gate(config), exposed)
+    return RunSource(path, manifest.shards, progress, space, config, lines)
 
 
 def _comments(config: Config, space: Space, gate: LodGate | None, exposed: bool) -> list[str]:
