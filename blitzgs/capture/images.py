@@ -46,6 +46,7 @@ from blitzgs.capture.masks import FileCheck, mask_error, misfit
 from blitzgs.capture.shared_images import BoundedCache as BoundedCache
 from blitzgs.capture.shared_images import SharedImages
 from blitzgs.formats import native
+from blitzgs.util.errors import UserError
 from blitzgs.util.terminal import amount
 
 DEFAULT_BUDGET = 4 << 30
@@ -77,7 +78,7 @@ class ImageMemory:
         )
 
 
-class PhotographError(RuntimeError):
+class PhotographError(UserError):
     """A photograph cannot be read; the message names the file."""
 
 

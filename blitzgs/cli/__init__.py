@@ -62,20 +62,6 @@ COMMANDS = {
     ),
 }
 
-# Errors that a user can cause and correct: they are reported as a message. Any other error is a fault of the
-# program and keeps its traceback. The second part is imported only when an error is to be judged.
-_USER_ERRORS: tuple[type[BaseException], ...] = (ValueError, OSError, ImportError, MemoryError)
-_NAMED_ERRORS = (
-    "blitzgs.capture.images.PhotographError",
-    "blitzgs.distributed.group.MismatchError",
-    "blitzgs.runs.checkpoint.CheckpointError",
-    "blitzgs.runs.folder_checks.FolderError",
-    "blitzgs.runs.guard.ModelLostError",
-    "blitzgs.runs.guard.NonFiniteError",
-    "blitzgs.table.host_table.HostMemoryError",
-    "blitzgs.table.pool.PoolError",
-)
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status (1: failed, 2: wrong usage, 130: Ctrl-C).
@@ -116,12 +102,15 @@ def _run(given: list[str]) -> int:
         print(f"{name}: interrupted", file=sys.stderr)
         return 130
     except Exception as error:
-        if not isinstance(error, _user_errors()):
+        from rich.console import Console
+
+        from blitzgs.util.errors import UserError
+
+        # Any other error is a fault of the program and keeps its traceback.
+        if not isinstance(error, (ValueError, OSError, ImportError, MemoryError, UserError)):
             raise
         # Those of Python's imports and of YAML have lines.
         lines = isinstance(error, ImportError) or type(error).__name__ == "ConfigError"
-        from rich.console import Console
-
         text = f"{name}: {printable(_message(error), lines)}"
         console = Console(stderr=True, highlight=False, emoji=False)
         console.print(text, style="red", markup=False, soft_wrap=True)
@@ -187,11 +176,6 @@ def _importing(name: str) -> Iterator[None]:
         gc.enable()
         if usual:
             signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def _user_errors() -> tuple[type[BaseException], ...]:
-    named = (path.rpartition(".") for path in _NAMED_ERRORS)
-    return (*_USER_ERRORS, *(getattr(import_module(module), name) for module, _, name in named))
 
 
 def _message(error: BaseException) -> str:

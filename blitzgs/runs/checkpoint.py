@@ -25,7 +25,7 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks
 from blitzgs.population.redistribution import global_positions
 from blitzgs.runs.checkpoint_files import DAMAGE, Manifest, Shard, finish, opened, verified, write_shard
-from blitzgs.util.errors import warn
+from blitzgs.util.errors import UserError, warn
 from blitzgs.util.output import check_space, explain, is_lack_of_space
 
 T = TypeVar("T")
@@ -35,7 +35,7 @@ _NAME = re.compile(r"checkpoint_(\d{6,})")
 _UNFINISHED = ".unfinished_"
 
 
-class CheckpointError(RuntimeError):
+class CheckpointError(UserError):
     """A checkpoint could not be written or read; the message names the checkpoint and the reason."""
 
     def __init__(self, message: str, lacks_space: bool = False) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from blitzgs.distributed.group import Ranks
 from blitzgs.table.table import GaussianTable
 from blitzgs.util import output
-from blitzgs.util.errors import warn
+from blitzgs.util.errors import UserError, warn
 from blitzgs.util.terminal import amount
 
 LOCK = ".lock"
@@ -25,7 +25,7 @@ LOCK_SECONDS = 5.0
 _PROBE_BYTES = 4096
 
 
-class FolderError(RuntimeError):
+class FolderError(UserError):
     """The folder of a run cannot be used; the message names the ranks and the reason."""
 
 

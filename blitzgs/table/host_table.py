@@ -14,12 +14,13 @@ from torch import Tensor
 
 from blitzgs.ops.rows import take_rows
 from blitzgs.table.table import GROWTH, GaussianTable
+from blitzgs.util.errors import UserError
 from blitzgs.util.terminal import amount
 
 MEMORY_INFO = Path("/proc/meminfo")
 
 
-class HostMemoryError(RuntimeError):
+class HostMemoryError(UserError):
     """The host has too little memory for the table; the message names the sizes and a remedy."""
 
 
