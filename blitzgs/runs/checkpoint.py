@@ -108,26 +108,18 @@ class Saving:
         shared: Mapping[str, Tensor],
         device: torch.device,
         ready: torch.cuda.Event | None,
-    ) -> tuple[Shard | None, Shard | None, str | None, bool]:
-        """Write this rank's files; return what they are, or why there are none and whether space lacks."""
-        ranks = self._ranks
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            check_space(self._folder, columns)
-            file = f"shard_{ranks.rank:04d}_of_{ranks.world_size:04d}.safetensors"
-            # On a stream of its own, copies to the host wait for no later work.
-            with torch.cuda.stream(None if ready is None else torch.cuda.Stream(device)):
-                if ready is not None:
-                    ready.wait()
-                mine = Shard(file, self._rows, *write_shard(self._folder / file, columns))
-                common = None
-                if shared:
-                    written = write_shard(self._folder / SHARED, shared)
-                    common = Shard(SHARED, 0, *written)
-            return mine, common, None, True
-        except OSError as error:
-            text = f"rank {ranks.rank} could not write: {explain(error)}"
-            return None, None, text, is_lack_of_space(error)
+    ) -> tuple[Shard, Shard | None]:
+        """Write this rank's files, and return them."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        check_space(self._folder, columns)
+        file = f"shard_{self._ranks.rank:04d}_of_{self._ranks.world_size:04d}.safetensors"
+        # On a stream of its own, copies to the host wait for no later work.
+        with torch.cuda.stream(None if ready is None else torch.cuda.Stream(device)):
+            if ready is not None:
+                ready.wait()
+            mine = Shard(file, self._rows, *write_shard(self._folder / file, columns))
+            common = Shard(SHARED, 0, *write_shard(self._folder / SHARED, shared)) if shared else None
+        return mine, common
 
     def finish(self) -> Path:
         """Wait until all ranks have written, and give the checkpoint its name. Collective.
@@ -137,8 +129,14 @@ class Saving:
         unchanged. ValueError: a column has a dtype that the format lacks.
         """
         ranks, path = self._ranks, self._directory / self._name
-        with ranks.watchdog.working("writing a checkpoint"):
-            mine, common, problem, lacks_space = self._written.result()
+        mine = common = problem = None
+        lacks_space = True
+        try:
+            with ranks.watchdog.working("writing a checkpoint"):
+                mine, common = self._written.result()
+        except OSError as error:
+            problem = f"rank {ranks.rank} could not write: {explain(error)}"
+            lacks_space = is_lack_of_space(error)
         results = ranks.all_gather_object((mine, problem, lacks_space))
         problems = [text for _, text, _ in results if text]
         lacks_space = all(lacks for _, _, lacks in results)

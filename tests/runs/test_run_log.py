@@ -120,20 +120,9 @@ def test_what_is_shown_is_a_running_mean_and_the_held_out_figure(tmp_path, monke
     ]  # the file has each view's own
 
 
-class Broken:
-    """A frame that names CUDA as its device, so that the guard reads sums a step later, as on CUDA."""
-
-    def __init__(self, frame, device="cpu"):
-        self._frame, self._device = frame, device
-
-    def __getattr__(self, name):
-        found = getattr(self._frame, name)
-        if name == "renders" and self._device == "cuda":
-            return OnCuda(found)
-        return found
-
-
 class OnCuda:
+    """Images that name CUDA as their device, so that the guard reads sums a step later, as on CUDA."""
+
     device = torch.device("cuda")
 
     def __init__(self, tensor):
@@ -190,7 +179,7 @@ def test_the_guard_names_the_pixel_and_says_what_it_has_looked_at(frame):
     ):
         LossGuard().check(9, ("a", "b"), bad, table, rendered)
     # A step later, the message does not name data that no longer exist.
-    guard, late = LossGuard(), Broken(rendered, "cuda")
+    guard, late = LossGuard(), rendered._replace(renders=OnCuda(rendered.renders))
     guard.check(9, ("a", "b"), bad, table, late)
     with pytest.raises(NonFiniteError) as failure:
         guard.check(10, ("c", "d"), Sums(0, 0, 0, 0), table, late)
@@ -199,7 +188,7 @@ def test_the_guard_names_the_pixel_and_says_what_it_has_looked_at(frame):
     assert "in step 10 the parameters are finite" in text and "view 'c', 'd'" in text
     guard.check(9, ("a", "b"), bad, table, late)
     splats = rendered.projected._replace(depths=rendered.projected.depths * torch.inf)
-    spoiled = Broken(rendered._replace(projected=splats), "cuda")
+    spoiled = late._replace(projected=splats)
     with pytest.raises(NonFiniteError, match="found in step 10: .* op project, output depths"):
         guard.check(10, ("c", "d"), Sums(0, 0, 0, 0), table, spoiled)
 
