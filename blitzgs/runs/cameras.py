@@ -157,7 +157,7 @@ def warn_of_changes(folder: Path, capture: Capture) -> None:
     try:
         views = json.loads((folder / CAMERAS).read_text(encoding="utf-8"))["cameras"]
         before = {view["name"]: view.get("stamp", "") for view in views}
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+    except DAMAGE:
         return  # an older run, or a damaged file, which is named where it is needed
     now = _stamps(capture)
     changed = [name for name, stamp in before.items() if stamp and now.get(name, "") not in ("", stamp)]

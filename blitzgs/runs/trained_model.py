@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs import checkpoint
 from blitzgs.runs.cameras import CAMERAS, stored_exposures
 from blitzgs.runs.checkpoint import CheckpointError
+from blitzgs.runs.checkpoint_files import DAMAGE
 from blitzgs.runs.guard import bad_column, check_before_saving
 from blitzgs.runs.log import LOG, records
 from blitzgs.runs.resume import compare_with_file
@@ -223,15 +224,13 @@ def parsed(
 
 def known_id(folder: Path) -> str:
     """Return the id of the run in a folder, from its cameras, else from its log; empty if it is not known."""
-    try:
-        found = json.loads((folder / CAMERAS).read_text(encoding="utf-8")).get("run", "")
-    except (OSError, ValueError, AttributeError, RecursionError):
-        found = ""
-    if isinstance(found, str) and found:
-        return found
-    with contextlib.suppress(OSError):
-        found = [record["run"] for record in records(folder / LOG) if isinstance(record.get("run"), str)]
-        return found[-1] if found else ""
+    with suppress(*DAMAGE):
+        found = json.loads((folder / CAMERAS).read_text(encoding="utf-8"))["run"]
+        if isinstance(found, str) and found:
+            return found
+    with suppress(OSError):
+        ids = [record["run"] for record in records(folder / LOG) if isinstance(record.get("run"), str)]
+        return ids[-1] if ids else ""
     return ""
 
 
