@@ -311,9 +311,11 @@ def _cleaned(model: Model, folder: Path, args: argparse.Namespace, path: Path, r
     cameras = open_run(folder).cameras()
     found = cleaned(model, cameras, args.clean, ranks, photographs(folder, args.data))
     picture = path.with_name(path.name + ".clean.jpg")
-    found.write_picture(picture)
-    gone = len(model) - int(found.kept.sum())
-    print(f"--clean: {gone:,} of {len(model):,} Gaussians go" + (f", see {picture}" if gone else ""))
+    gone, shown = len(model) - int(found.kept.sum()), ""
+    if found.picture is not None:
+        write_file(picture, found.picture)
+        shown = f", see {picture}"
+    print(f"--clean: {gone:,} of {len(model):,} Gaussians go{shown}")
     if found.psnr is not None:
         before, after = found.psnr
         print(f"held-out PSNR: {before:.3f} dB before, {after:.3f} dB after")

@@ -370,13 +370,6 @@ def test_antialiased_models_are_marked_and_can_be_baked(tmp_path, capsys):
     assert gain > 3, errors
 
 
-def test_export_refuses_a_name_that_promises_another_format(trained, tmp_path, capsys):
-    path = tmp_path / "model.spz"
-    assert main(["export", str(trained[1]), "--ply", str(path)]) == 1
-    assert "model.spz: the file will be PLY: choose a name that ends in .ply" in capsys.readouterr().err
-    assert not path.exists()
-
-
 # Paths may have any characters.
 
 
