@@ -97,7 +97,7 @@ def _run(given: list[str]) -> int:
             parser.print_help(sys.stderr)
             return 2
         args = _arguments(parser, command, chosen, given)
-        return cast(Callable[[argparse.Namespace], int], args.run)(args)
+        return cast(Callable[[argparse.Namespace], int | None], args.run)(args) or 0
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         return 130

@@ -27,12 +27,12 @@ Commands = argparse._SubParsersAction  # argparse has no public name for it
 def add_command(
     commands: Commands[argparse.ArgumentParser],
     name: str,
-    function: Callable[[argparse.Namespace], int],
+    function: Callable[[argparse.Namespace], int | None],
     summary: str,
     description: str | None = None,
     add_help: bool = True,
 ) -> argparse.ArgumentParser:
-    """Add a command that calls `function` with its arguments and exits with what it returns.
+    """Add a command that calls `function` with its arguments and exits with what it returns, or 0.
 
     Without `add_help`, the caller adds the flag --help.
     """

@@ -47,10 +47,9 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     parser.add_argument("shell", metavar="SHELL", choices=("bash", "zsh", "fish"))
 
 
-def run(args: argparse.Namespace) -> int:
-    """Print the script; returns the exit status."""
+def run(args: argparse.Namespace) -> None:
+    """Print the script."""
     print(script(args.shell))
-    return 0
 
 
 def script(shell: str) -> str:

@@ -61,8 +61,8 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
     parser.set_defaults(pictures=8)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Measure the views of a run; returns the exit status."""
+def run(args: argparse.Namespace) -> None:
+    """Measure the views of a run."""
     if args.pictures < 0:
         raise ValueError(f"--pictures: must be 0 or more, got {args.pictures}")
     with Ranks.from_environment(args.device, share_gpus=args.share_gpus) as ranks:
@@ -113,7 +113,6 @@ def run(args: argparse.Namespace) -> int:
                 print(printable(f"among the worst views: {view} {psnr:.2f} dB"), file=sys.stderr)
             what = f"metrics.json and pictures of {len(indices)} views, {largest_size(capture)} pixels"
             print(f"{folder}: {what}", file=sys.stderr)
-    return 0
 
 
 def _config_of(found: Gaussians, data: Path | None, downscale: int | None) -> Config:

@@ -83,8 +83,8 @@ def _add_gate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("gate", type=gate_file, metavar="GATE", help=text)
 
 
-def run_fit(args: argparse.Namespace) -> int:
-    """Fit a gate; returns the exit status."""
+def run_fit(args: argparse.Namespace) -> None:
+    """Fit a gate."""
     if args.out.suffix != ".json":
         raise ValueError(f"--out {args.out}: a gate's file ends in .json")
     if not args.gate_from >= 0:
@@ -98,11 +98,10 @@ def run_fit(args: argparse.Namespace) -> int:
     print(f"{args.out}: fitted on {len(runs)} run{'s' * (len(runs) > 1)}; {figures['protocol']}:")
     for entry in figures["held_out"]:
         print(f"  {_judgement(entry)}")
-    return 0
 
 
-def run_sample(args: argparse.Namespace) -> int:
-    """Write a sample of spawns; returns the exit status."""
+def run_sample(args: argparse.Namespace) -> None:
+    """Write a sample of spawns."""
     if args.out.suffix != spawn_samples.SUFFIX:
         raise ValueError(f"--out {args.out}: a sample's file ends in {spawn_samples.SUFFIX}")
     if args.rows < 1:
@@ -111,11 +110,10 @@ def run_sample(args: argparse.Namespace) -> int:
     args.out.parent.mkdir(parents=True, exist_ok=True)
     rate = spawn_samples.write_sample(run, args.out, args.rows)
     print(f"{args.out}: {rate:.2%} of {len(run.survived):,} spawns of {run.name}")
-    return 0
 
 
-def run_evaluate(args: argparse.Namespace) -> int:
-    """Judge a gate; returns the exit status."""
+def run_evaluate(args: argparse.Namespace) -> None:
+    """Judge a gate."""
     gate = SpawnGate(args.gate)
     runs = [_spawns_of(folder) for folder in args.runs]
     output = OutputFolder(args.out)
@@ -132,11 +130,10 @@ def run_evaluate(args: argparse.Namespace) -> int:
         regions = "" if r is None else f"; regions r {r:.2f}"
         print(_judgement(result) + regions + seen)
     print(f"{args.out}: {figures.name}, {gate_fit.SURVIVAL} and maps of regions")
-    return 0
 
 
-def run_replay(args: argparse.Namespace) -> int:
-    """Train the arms; returns the exit status."""
+def run_replay(args: argparse.Namespace) -> None:
+    """Train the arms."""
     if not 0 <= args.rate <= 1:
         raise ValueError(f"--rate: must be in [0, 1], got {args.rate}")
     gate = SpawnGate(args.gate)
@@ -159,7 +156,6 @@ def run_replay(args: argparse.Namespace) -> int:
                 (args.out / TABLE).write_text(_table(results))
         if ranks.rank == 0:
             print(_table(results))
-    return 0
 
 
 def _spawns_of(folder: Path) -> gate_fit.Spawns:

@@ -95,8 +95,8 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
 _OTHER_FILMS = (".gif", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".webp")
 
 
-def run(args: argparse.Namespace) -> int:
-    """Render views; returns the exit status."""
+def run(args: argparse.Namespace) -> None:
+    """Render views."""
     film = _film(args)
     is_film = args.out.suffix.lower() == SUFFIX
     if film is not None and is_film:
@@ -110,7 +110,6 @@ def run(args: argparse.Namespace) -> int:
         if ranks.rank == 0:
             count, what = len(opened.indices), "frames" if is_film else "images"
             print(f"{args.out}: {count} {what}")
-    return 0
 
 
 def _film(args: argparse.Namespace) -> Film | None:

@@ -146,8 +146,8 @@ class _Help(argparse.Action):
         parser.exit()
 
 
-def run(args: argparse.Namespace) -> int:
-    """Train; returns the exit status."""
+def run(args: argparse.Namespace) -> None:
+    """Train."""
     if args.extend is not None and args.minutes is not None:
         args.parser.error("--extend and --minutes exclude each other: --extend says how many images")
     args.resume = args.resume or args.extend is not None
@@ -157,7 +157,7 @@ def run(args: argparse.Namespace) -> int:
     config = _config(args)
     if args.show_config:
         print(json.dumps(to_dict(config), indent=1))
-        return 0
+        return
     if args.viewer is not None:
         from blitzgs.viewer.page import require_viser
 
@@ -217,13 +217,12 @@ def run(args: argparse.Namespace) -> int:
                 write_final_report(args.out, summary)
                 if summary is not None:
                     _print_summary(summary, args.out)
-    return 0
 
 
-def _check(args: argparse.Namespace, config: Config) -> int:
+def _check(args: argparse.Namespace, config: Config) -> None:
     if not args.no_sfm and (text := understood_alone(config)) is not None:
         print(text)
-        return 0
+        return
     capture, images = open_capture(config, Ranks())
     check_worlds(capture)
     lines = understood(config, capture, images)
@@ -234,7 +233,6 @@ def _check(args: argparse.Namespace, config: Config) -> int:
     rough = estimate(config, capture, _on_gpu(args), torch.get_num_threads())
     lines.append(f"{'training:':15}{rough}")
     print("\n".join(lines), flush=True)
-    return 0
 
 
 def _on_gpu(args: argparse.Namespace) -> bool:

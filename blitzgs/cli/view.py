@@ -68,10 +68,11 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     add_device(parser)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Show a model until Ctrl-C; returns the exit status."""
+def run(args: argparse.Namespace) -> None:
+    """Show a model until Ctrl-C."""
     if (args.model / TILESET).is_file():
-        return serve_tiles(args.model, args.host, args.port)
+        serve_tiles(args.model, args.host, args.port)
+        return
     if (args.model / META).is_file():
         raise ValueError(f"{args.model} is streamed SOG, which SuperSplat shows; blitzgs view needs --tiles")
     from blitzgs.viewer.page import require_viser
@@ -97,7 +98,6 @@ def run(args: argparse.Namespace) -> int:
         print()
     finally:
         studio.close()
-    return 0
 
 
 def photographs(folder: Path, data: Path | None) -> Callable[[int], npt.NDArray[np.uint8]] | None:
@@ -149,8 +149,8 @@ def tiles_server(folder: Path, host: str, port: int) -> ThreadingHTTPServer:
         raise unheard(host, port, error) from error
 
 
-def serve_tiles(folder: Path, host: str, port: int) -> int:
-    """Serve until Ctrl-C; returns the exit status."""
+def serve_tiles(folder: Path, host: str, port: int) -> None:
+    """Serve until Ctrl-C."""
     with tiles_server(folder, host, port) as server:
         shown = "localhost" if is_loopback(host) else host
         print(f"{folder}: open http://{shown}:{server.server_port}/ (Ctrl-C ends)", flush=True)
@@ -158,7 +158,6 @@ def serve_tiles(folder: Path, host: str, port: int) -> int:
             server.serve_forever()
         except KeyboardInterrupt:
             print()
-    return 0
 
 
 REPORT_HELP = """\
@@ -176,8 +175,8 @@ def add_report(commands: Commands[argparse.ArgumentParser], summary: str) -> Non
     add_flags(parser, "--out FILE  the file (default: RUN/report.html)")
 
 
-def run_report(args: argparse.Namespace) -> int:
-    """Write the report; returns the exit status."""
+def run_report(args: argparse.Namespace) -> None:
+    """Write the report."""
     from blitzgs.report.report import look_of, write_report
 
     look = None
@@ -187,7 +186,6 @@ def run_report(args: argparse.Namespace) -> int:
         run_files.check_is_run(args.folder)
         print(printable(f"the report goes without the model in 3D: {error}"), file=sys.stderr)
     print(printable(str(write_report(args.folder, look, args.out))))
-    return 0
 
 
 # The model in 3D is read from the checkpoint, beside the model in memory: only up to so many Gaussians.
@@ -237,10 +235,9 @@ def add_compare(commands: Commands[argparse.ArgumentParser], summary: str) -> No
     add_path(parser, "--out", "FILE", "the file (default: %(default)s)", default=Path("compare.html"))
 
 
-def run_compare(args: argparse.Namespace) -> int:
-    """Write the page; returns the exit status."""
+def run_compare(args: argparse.Namespace) -> None:
+    """Write the page."""
     from blitzgs.report.report import compare, write_page
 
     write_page(args.out, compare(args.folders))
     print(printable(str(args.out)))
-    return 0
