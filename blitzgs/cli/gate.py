@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_flags, add_path
+from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_path
 from blitzgs.config.fields import ScheduleConfig
 from blitzgs.config.files import changed
 from blitzgs.config.schedule import Schedule
@@ -37,12 +37,6 @@ all births and deaths of Gaussians. The repository's docs/guide/fewer-gaussians.
 """
 
 
-FIT_FLAGS = """
---gate-from IMAGES  also evaluate separately the spawns (births during training) from this time on; take
-    schedule.gate_from times schedule.scale of the runs that will use the gate (default: %(default)s)
-"""
-
-
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = add_command(commands, "gate", lambda _: 2, summary, HELP)
@@ -50,15 +44,19 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     fit = add_command(actions, "fit", run_fit, "fit a gate on the lineage of runs")
     add_path(fit, "runs", "RUN", "folder of a run with lineage, or a sample", nargs="+")
     add_path(fit, "--out", "FILE", "file for the gate, .json", required=True)
-    add_flags(fit, FIT_FLAGS, {"--gate-from": float})
-    fit.set_defaults(gate_from=ScheduleConfig.gate_from)
+    fit.add_argument(
+        "--gate-from",
+        type=float,
+        default=ScheduleConfig.gate_from,
+        metavar="IMAGES",
+        help="also evaluate separately the spawns (births during training) from this time on; take "
+        "schedule.gate_from times schedule.scale of the runs that will use the gate (default: %(default)s)",
+    )
     sample = add_command(actions, "sample", run_sample, "reduce the lineage of a run to one file")
     add_path(sample, "folder", "RUN", "folder of a run with lineage")
     add_path(sample, "--out", "FILE", "file for the sample, .parquet", required=True)
-    add_flags(
-        sample, "--rows N  approximate number of births in the file (default: %(default)s)", {"--rows": int}
-    )
-    sample.set_defaults(rows=spawn_samples.MAX_ROWS)
+    text = "approximate number of births in the file (default: %(default)s)"
+    sample.add_argument("--rows", type=int, default=spawn_samples.MAX_ROWS, metavar="N", help=text)
     judge = add_command(actions, "evaluate", run_evaluate, "measure a gate on the lineage of runs")
     _add_gate(judge)
     add_path(judge, "runs", "RUN", "folder of a run with lineage", nargs="+")
@@ -72,8 +70,8 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     _add_gate(again)
     add_path(again, "folder", "RUN", "folder of a run with lineage")
     add_path(again, "--out", "DIR", "folder for these runs and their figures", required=True)
-    add_flags(again, "--rate RATE  share of the candidates to withhold (default: 0.6)", {"--rate": float})
-    again.set_defaults(rate=0.6)
+    text = "share of the candidates to withhold (default: %(default)s)"
+    again.add_argument("--rate", type=float, default=0.6, metavar="RATE", help=text)
     add_capture(again)
     add_device(again, shares_gpus=True)
 

@@ -151,7 +151,7 @@ def run(args: argparse.Namespace) -> None:
     if args.extend is not None and args.minutes is not None:
         args.parser.error("--extend and --minutes exclude each other: --extend says how many images")
     args.resume = args.resume or args.extend is not None
-    if args.out is None and not args.show_config and not args.check:
+    if args.out is None and not args.show_config and (args.resume or not args.check):
         needed = "--out" if args.data or args.config else "--data, --out"
         args.parser.error(f"the following arguments are required: {needed}")
     config = _config(args)
@@ -167,14 +167,15 @@ def run(args: argparse.Namespace) -> None:
             f"{args.out} holds no run to continue (it has no config.yaml): check --out, or name the capture "
             "of a new run with --data"
         )
-    if args.check:
-        return _check(args, config)
     # Before the photographs, which take long.
-    check_unclaimed(args.out, args.resume)
     if (gate := config.population.gate) is not None and gate != RANDOM:
         SpawnGate(gate_file(gate))
     if config.model.start and not args.resume and not Path(config.model.start).exists():
         raise FileNotFoundError(f"{config.model.start}: there is no such file of Gaussians (--start)")
+    if args.check:
+        _check(args, config)
+        return
+    check_unclaimed(args.out, args.resume)
     if (photographs := Path(config.data.path) / config.data.images).is_dir():
         check_outside(args.out, photographs)
     job, laps = config.ranks, Laps(since_start=True)

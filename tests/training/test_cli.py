@@ -120,6 +120,7 @@ def test_torchrun_entry(trained, tmp_path):
         (["eval", "x", "--pictures", "1", "--pictures=2"], 2, "--pictures is given twice"),
         (["train", "--out", "x", "--out=y"], 2, "--out is given twice"),
         (["train", "--out", "x", "--extend=2", "--minutes=3"], 2, "--extend and --minutes exclude"),
+        (["train", "--check", "--resume"], 2, "required: --data, --out"),
         (["train", "--out", "x", "--seed=1", "--seed=2"], 2, "--seed is given twice"),
         (["train", "--out", "x", "--log.every", "1", "--log.every=1"], 2, "--log.every is given twice"),
         (
