@@ -144,7 +144,7 @@ class Saving:
             try:
                 with ranks.watchdog.working("finishing a checkpoint"):
                     shards = [shard for shard, _, _ in results if shard]
-                    finish(self._folder, path, shards, common, self._state, ranks.world_size)
+                    finish(self._folder, path, Manifest(shards, common, self._state))
             except OSError as error:
                 problems.append(f"rank 0 could not write: {explain(error)}")
                 lacks_space = is_lack_of_space(error)
@@ -170,7 +170,7 @@ class Loaded:
     """A checkpoint in memory."""
 
     columns: dict[str, Tensor]  # columns of this rank's shard, [N_rank, ...], on the device
-    state: dict[str, Any]  # the state that was saved with them
+    state: Mapping[str, Any]  # the state that was saved with them
     shared: dict[str, Tensor]  # tensors that are the same on all ranks, on the CPU; empty if none were stored
 
 

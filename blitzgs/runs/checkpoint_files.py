@@ -46,7 +46,7 @@ class Manifest:
 
     shards: list[Shard]
     shared: Shard | None
-    state: dict[str, Any]
+    state: Mapping[str, Any]
 
 
 def verified(path: Path, part: int = 0, parts: int = 1) -> Manifest:
@@ -91,25 +91,12 @@ def _verify(path: Path, shard: Shard) -> None:
         raise ValueError(f"{shard.file} does not match its SHA-256")
 
 
-def finish(
-    unfinished: Path,
-    path: Path,
-    shards: list[Shard],
-    shared: Shard | None,
-    state: Mapping[str, Any],
-    world_size: int,
-) -> None:
+def finish(unfinished: Path, path: Path, manifest: Manifest) -> None:
     """Write the manifest beside the shards and give the folder its final name, each step synced."""
-    missing = [shard.file for shard in shards if not (unfinished / shard.file).exists()]
+    missing = [shard.file for shard in manifest.shards if not (unfinished / shard.file).exists()]
     if missing:
         raise OSError(f"{', '.join(missing)} not in {unfinished}: every rank must see the same file system")
-    content = {
-        "format": FORMAT,
-        "world_size": world_size,
-        "shards": [asdict(shard) for shard in shards],
-        "shared": None if shared is None else asdict(shared),
-        "state": dict(state),
-    }
+    content = {"format": FORMAT, "world_size": len(manifest.shards)} | asdict(manifest)
     content = json.loads(json.dumps(content))  # tuples become lists: what is read back has the same digest
     with open(unfinished / MANIFEST, "w") as file:
         json.dump(content | {"sha256": _digest(content)}, file, indent=1)
