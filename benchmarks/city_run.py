@@ -30,7 +30,7 @@ from quality_run import describe, means_of, write
 
 from blitzgs.config.fields import Config
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs.log import LOG
+from blitzgs.runs.run_files import LOG
 from blitzgs.runs.trained_model import TrainedModel
 from blitzgs.training.agreement import Agreement
 from blitzgs.training.events.evaluate import measure

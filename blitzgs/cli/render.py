@@ -27,7 +27,7 @@ from blitzgs.cli.arguments import chosen_views
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files, trained_model
-from blitzgs.runs.cameras import CAMERAS, RunCameras, input_files, load_cameras
+from blitzgs.runs.cameras import RunCameras, input_files, load_cameras
 from blitzgs.runs.evaluation import render_view
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.inputs import check_capture, open_capture
@@ -306,7 +306,7 @@ def _stored_cameras(
 
     Frames and cameras of a file need neither, so None is returned if the run has not stored its cameras.
     """
-    if args.data is None and (folder / CAMERAS).exists():
+    if args.data is None and (folder / run_files.CAMERAS).exists():
         return load_cameras(folder)
     if args.data is None and (args.path is not None or args.cameras is not None):
         return None

@@ -26,13 +26,12 @@ from blitzgs.config.files import ConfigError, changed, default_recipe, load_conf
 from blitzgs.config.ranges import describe, describe_all, describe_page
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import run_files
-from blitzgs.runs.folder_checks import locked
+from blitzgs.runs.folder_checks import check_unclaimed, locked
 from blitzgs.runs.resume import check_before_capture
 from blitzgs.sfm.refine import fit_of
 from blitzgs.spawn.gate import RANDOM, SpawnGate, gate_file
 from blitzgs.training.budget import LEAST_IMAGES, estimate
 from blitzgs.training.inputs import open_capture, read_ahead
-from blitzgs.training.setup import check_unclaimed
 from blitzgs.training.state import TrainingState
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.understood import check_worlds, understood

@@ -19,7 +19,7 @@ import numpy as np
 from blitzgs.capture.cameras import camera_centres
 from blitzgs.capture.world import GEOCENTRIC, WorldFrame
 from blitzgs.runs import run_files
-from blitzgs.runs.cameras import CAMERAS, EXPOSURES, RunCameras, load_cameras
+from blitzgs.runs.cameras import RunCameras, load_cameras
 from blitzgs.runs.checkpoint_files import DAMAGE
 from blitzgs.runs.evaluation import FOLDER, INDEX, METRICS, PARTS, preview_file
 from blitzgs.runs.folder import RunFolder, open_run
@@ -75,7 +75,7 @@ def read_run(path: Path) -> RunData:
     identity = _start_of(records).get("run")
     data.log = [record for record in records if record.get("run") == identity]
     try:
-        if (path / CAMERAS).exists():
+        if (path / run_files.CAMERAS).exists():
             data.cameras = load_cameras(path)
         data.frame = load_world_frame(path)
     except ValueError as error:
@@ -213,7 +213,7 @@ def exposures(data: RunData) -> list[list[Any]]:
             raise ValueError("an exposure has another number of values")
         return [rows[index] for index in evenly(list(range(len(rows))), MAX_LISTED)]
 
-    return _parsed(data.folder.path / EXPOSURES, data.problems, listed, [])
+    return _parsed(data.folder.path / run_files.EXPOSURES, data.problems, listed, [])
 
 
 def pictured(data: RunData) -> dict[str, int]:

@@ -24,7 +24,7 @@ from blitzgs.config.files import load_config
 from blitzgs.distributed.group import Ranks, resolve_device
 from blitzgs.runs import run_files, trained_model
 from blitzgs.runs.cameras import RunCamera, RunCameras, checked_camera, load_cameras
-from blitzgs.runs.log import LOG, records
+from blitzgs.runs.log import records
 from blitzgs.runs.trained_model import TrainedModel
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.view.gate import ModelGate, centres_of
@@ -205,7 +205,7 @@ class RunFolder:
 
     def log(self) -> list[dict[str, Any]]:
         """Return the records of the log, oldest first, without incomplete lines."""
-        return list(records(self.path / LOG))
+        return list(records(self.path / run_files.LOG))
 
     def metrics(self) -> dict[str, dict[str, Any]]:
         """Return the evaluations: number of images seen, or split -> metrics, each view's under "views"."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks the folder of a training: no other one uses it, all ranks can write to it, and there is space."""
+"""Checks the folder of a training: what is in it, who uses it, whether ranks can write, and space."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from blitzgs.distributed.group import Ranks
+from blitzgs.runs.run_files import CHECKPOINTS, WRITTEN
 from blitzgs.table.table import GaussianTable
 from blitzgs.util import output
 from blitzgs.util.errors import UserError, warn
@@ -72,6 +73,28 @@ def _lock(path: Path, stack: contextlib.ExitStack) -> str | None:
     os.ftruncate(descriptor, 0)
     os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
     return None
+
+
+def check_unclaimed(folder: Path, resume: bool) -> None:
+    """Check that a run replaces nothing in its folder; a folder with checkpoints is a run's.
+
+    FileExistsError: the folder holds checkpoints and `resume` is not set, or files of another program that
+    have the names of a run's. NotADirectoryError: the folder or that of its checkpoints is a file.
+    """
+    try:
+        found = os.listdir(folder / CHECKPOINTS)
+    except FileNotFoundError:
+        for name in WRITTEN:
+            if os.path.lexists(folder / name):
+                raise FileExistsError(
+                    f"{folder} has {name}, which a run would replace, and no checkpoints: choose another "
+                    "--out"
+                ) from None
+        return
+    if not resume and any(name.startswith("checkpoint_") for name in found):
+        raise FileExistsError(
+            f"{folder} already holds a run: add --resume to continue it, or choose another --out"
+        )
 
 
 def check_writable(folder: Path, ranks: Ranks) -> None:

@@ -21,12 +21,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Column
 
+from blitzgs.runs.run_files import LOG
 from blitzgs.util.errors import warn
 from blitzgs.util.output import write_file
 from blitzgs.util.progress import Report, lines
 from blitzgs.util.terminal import printable
 
-LOG = "log.jsonl"
 BOARD = "tensorboard"
 # Largest number of records that are kept while the disk is full; then the oldest are dropped.
 _MAX_WAITING = 10_000

@@ -5,14 +5,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
-CONFIG = "config.yaml"
+CONFIG = "config.yaml"  # the resolved configuration
+CAMERAS = "cameras.json"  # all cameras, and which are held out
+LOG = "log.jsonl"
 CHECKPOINTS = "checkpoints"
-SUMMARY = "summary.json"
+EVALUATION = "evaluation"  # a folder for each evaluation
+TRAINED_VIEWS = "trained.json"  # in that of the last evaluation: metrics of some training views
+LINEAGE = "lineage"  # births and deaths of Gaussians
+EXPOSURES = "exposures.json"  # of a finished run: gain and bias, [2, 3], by the name of the photograph
+SUMMARY = "summary.json"  # of a finished run
 REPORT = "report.html"
-EVALUATION = "evaluation"
-# In the folder of a run's last evaluation: metrics of some training views.
-TRAINED_VIEWS = "trained.json"
-LINEAGE = "lineage"
+PICTURE = "trajectory.svg"  # the population over time
+# What a run writes beside its checkpoints.
+WRITTEN = (CONFIG, CAMERAS, LOG, SUMMARY, PICTURE, LINEAGE, REPORT, EXPOSURES)
 
 
 def run_and_checkpoint(path: Path) -> tuple[Path, str | None]:

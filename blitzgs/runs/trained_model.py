@@ -19,13 +19,13 @@ from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs import checkpoint
-from blitzgs.runs.cameras import CAMERAS, stored_exposures
+from blitzgs.runs.cameras import stored_exposures
 from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.checkpoint_files import DAMAGE
 from blitzgs.runs.guard import bad_column, check_before_saving
-from blitzgs.runs.log import LOG, records
+from blitzgs.runs.log import records
 from blitzgs.runs.resume import compare_with_file
-from blitzgs.runs.run_files import CHECKPOINTS, CONFIG, check_is_run
+from blitzgs.runs.run_files import CAMERAS, CHECKPOINTS, CONFIG, LOG, check_is_run
 from blitzgs.table.blocks import sort_rows
 from blitzgs.table.host_table import HostTable, available_bytes
 from blitzgs.table.pool import Pool

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import secrets
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,9 +22,9 @@ from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import INITIAL_OPACITY, octree_gaussians
 from blitzgs.population.relocation import PositionNoise
 from blitzgs.runs import run_files
-from blitzgs.runs.cameras import CAMERAS, EXPOSURES, SHARED_EXPOSURES, save_cameras, warn_of_changes
-from blitzgs.runs.folder_checks import check_room, check_writable
-from blitzgs.runs.log import LOG, RunLog
+from blitzgs.runs.cameras import SHARED_EXPOSURES, save_cameras, warn_of_changes
+from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writable
+from blitzgs.runs.log import RunLog
 from blitzgs.runs.resume import check_resumable, decided_as, with_pace_of
 from blitzgs.runs.trained_model import Progress, TrainedModel, restore
 from blitzgs.runs.world import check_seen, save_world_frame, trained_columns
@@ -41,7 +40,6 @@ from blitzgs.training.exposure import Exposures, exposures_differ, track_gains
 from blitzgs.training.inputs import check_alike, check_capture, check_resolution
 from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
-from blitzgs.training.records import PICTURE
 from blitzgs.training.sampler import BatchSampler, tour_of
 from blitzgs.training.state import Curve, TrainingState
 from blitzgs.training.step import Stepper
@@ -144,37 +142,9 @@ def set_up(
     )
 
 
-# What a run writes beside its checkpoints.
-_WRITTEN = (
-    run_files.CONFIG, CAMERAS, LOG, run_files.SUMMARY, PICTURE, run_files.LINEAGE, run_files.REPORT, EXPOSURES
-)  # fmt: skip
-
-
-def check_unclaimed(folder: Path, resume: bool) -> None:
-    """Check that a run replaces nothing in its folder; a folder with checkpoints is a run's.
-
-    FileExistsError: the folder holds checkpoints and `resume` is not set, or files of another program that
-    have the names of a run's. NotADirectoryError: the folder or that of its checkpoints is a file.
-    """
-    try:
-        found = os.listdir(folder / run_files.CHECKPOINTS)
-    except FileNotFoundError:
-        for name in _WRITTEN:
-            if os.path.lexists(folder / name):
-                raise FileExistsError(
-                    f"{folder} has {name}, which a run would replace, and no checkpoints: choose another "
-                    "--out"
-                ) from None
-        return
-    if not resume and any(name.startswith("checkpoint_") for name in found):
-        raise FileExistsError(
-            f"{folder} already holds a run: add --resume to continue it, or choose another --out"
-        )
-
-
 def _describe(folder: Path, config: Config, capture: Capture, run_id: str, is_new: bool) -> None:
     save_config(config, folder / run_files.CONFIG)
-    if is_new or not (folder / CAMERAS).exists():
+    if is_new or not (folder / run_files.CAMERAS).exists():
         save_cameras(folder, capture, run_id)
     if is_new and capture.about.frame is not None:
         save_world_frame(folder, capture.about.frame)

@@ -16,7 +16,8 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.runs import log as run_log
 from blitzgs.runs.folder_checks import FolderError, check_room, check_writable, locked
 from blitzgs.runs.guard import LossGuard, NonFiniteError
-from blitzgs.runs.log import LOG, RunLog
+from blitzgs.runs.log import RunLog
+from blitzgs.runs.run_files import LOG
 from blitzgs.runs.trained_model import known_id
 from blitzgs.training.trainer import Trainer
 from blitzgs.util import progress
