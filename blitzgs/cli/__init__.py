@@ -41,10 +41,7 @@ blitzgs train --help explains the training; blitzgs train --help FIELD explains 
 # For each command the module, with the function that adds it if that is not `add_to`, and what it does.
 COMMANDS = {
     "sfm": ("blitzgs.cli.sfm", "find out where photographs were taken from, and write a capture"),
-    "refine": (
-        "blitzgs.cli.sfm:add_refine",
-        "find lenses and poses of a capture anew, for sharper models",
-    ),
+    "refine": ("blitzgs.cli.sfm:add_refine", "find lenses and poses of a capture anew, for sharper models"),
     "train": ("blitzgs.cli.train", "train a model of photographs with known cameras"),
     "eval": ("blitzgs.cli.evaluate", "measure PSNR and SSIM of a run's held-out views"),
     "render": ("blitzgs.cli.render", "render views of a model to pictures, or a path to a film"),

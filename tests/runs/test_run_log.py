@@ -41,9 +41,8 @@ def work_on(folder, monkeypatch, terminal):
     with log.work("views measured") as report:
         for done in (1, 2):
             report(done, 2)
-        bars = (
-            [] if log._progress is None else [(bar.description, bar.completed) for bar in log._progress.tasks]
-        )
+        shown = [] if log._progress is None else log._progress.tasks
+        bars = [(bar.description, bar.completed) for bar in shown]
     log.close()
     return position, bars
 
@@ -115,10 +114,7 @@ def test_what_is_shown_is_a_running_mean_and_the_held_out_figure(tmp_path, monke
     assert "loss 0.4000  train 25.00 dB" in lines[1]
     assert "loss 0.1000  train 24.00 dB  held-out 22.50 dB" in lines[-2]
     assert "bad \\x1b[2J name" in lines[-1]
-    assert [record["psnr"] for record in records(tmp_path)[:2]] == [
-        20.0,
-        30.0,
-    ]  # the file has each view's own
+    assert [record["psnr"] for record in records(tmp_path)[:2]] == [20.0, 30.0]  # each view's own
 
 
 class OnCuda:
