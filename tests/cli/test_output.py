@@ -203,11 +203,10 @@ ROOT = Path(__file__).resolve().parents[2]
 REQUIREMENTS = re.findall(r'"(torch>=2\.11,<2\.14)"', (ROOT / "pyproject.toml").read_text())
 
 
-def report(*arguments, path=None, **variables):
-    """Run the command; return its exit status and its lines by name. `path` precedes the import path."""
-    environment = os.environ | variables | ({"PYTHONPATH": str(path)} if path else {})
+def report(*arguments, **variables):
+    """Run the command; return its exit status and its lines by name."""
     command = [sys.executable, "-m", "blitzgs", "doctor", "--json", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=ROOT)
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | variables, cwd=ROOT)
     found = json.loads(done.stdout)
     return done.returncode, {line["name"]: line for line in found["lines"]}
 
@@ -269,16 +268,13 @@ def test_a_library_that_does_not_load_is_named(tmp_path):
     assert lines["render cpu"]["state"] == "failed"
 
 
-def torch_of(version, **more):
-    return {"version": version, "cuda": None, "threads": 2, "gpus": [], "nccl": None} | more
-
-
 @pytest.mark.parametrize(
     "version, state", [("2.10.1", "failed"), ("2.11.0+cu130", "ok"), ("2.13.0", "ok"), ("2.14.0", "warning")]
 )
 def test_the_bounds_of_torch(version, state, monkeypatch):
     monkeypatch.setattr(doctor.metadata, "requires", lambda _: REQUIREMENTS)
-    monkeypatch.setattr(doctor, "probe", lambda *_: torch_of(version))
+    found = {"version": version, "cuda": None, "threads": 2, "gpus": [], "nccl": None}
+    monkeypatch.setattr(doctor, "probe", lambda _: found)
     assert doctor._torch().state == state
 
 
