@@ -19,8 +19,8 @@ from rich.table import Table
 
 from blitzgs.capture.colmap import find_models
 from blitzgs.cli.arguments import Commands, add_command, add_device, add_flags, number
+from blitzgs.cli.report import write_final_report
 from blitzgs.cli.sfm import understood_alone, with_poses
-from blitzgs.cli.view import kept_warnings, write_final_report
 from blitzgs.config.fields import Config, Transport
 from blitzgs.config.files import ConfigError, changed, default_recipe, load_config, recipe_path, to_dict
 from blitzgs.config.ranges import describe, describe_all, describe_page
@@ -35,6 +35,7 @@ from blitzgs.training.inputs import open_capture, read_ahead
 from blitzgs.training.state import TrainingState
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.understood import check_worlds, understood
+from blitzgs.util.errors import kept_warnings
 from blitzgs.util.output import check_outside
 from blitzgs.util.progress import Laps
 from blitzgs.util.terminal import printable

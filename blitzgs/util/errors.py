@@ -38,6 +38,24 @@ def warn(text: str, category: type[Warning] = UserWarning) -> None:
 
 
 @contextmanager
+def kept_warnings() -> Iterator[list[str]]:
+    """Yield a list that gets the texts of all warnings inside the context, which are shown as usual."""
+    texts: list[str] = []
+    usual = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        if issubclass(category, UserWarning):
+            texts.append(str(message))
+        usual(message, category, *place, **more)
+
+    warnings.showwarning = show
+    try:
+        yield texts
+    finally:
+        warnings.showwarning = usual
+
+
+@contextmanager
 def located(where: str) -> Iterator[None]:
     """Put a place before the text of a ValueError that leaves the context."""
     try:
