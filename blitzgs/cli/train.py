@@ -251,10 +251,6 @@ def _config(args: argparse.Namespace) -> Config:
         source = recipe_path(recipe)
         if os.environ.get("RANK", "0") == "0":  # torchrun's number of the process
             print(f"recipe: {recipe} (choose another one with --config)", file=sys.stderr)
-    if not args.resume and source is not None and own is not None and own.exists() and own.samefile(source):
-        raise ConfigError(
-            f"{source} would be overwritten by the new run's resolved configuration: choose another --out"
-        )
     minutes = [] if args.minutes is None else [f"schedule.minutes={args.minutes}"]
     begun = args.resume and own is not None and any((args.out / run_files.CHECKPOINTS).glob("checkpoint_*"))
     if args.minutes and begun and own is not None and own.exists() and load_config(own).schedule.minutes == 0:
