@@ -9,6 +9,7 @@ compares the files with the digests. The folder must be on a file system that ev
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import shutil
@@ -26,7 +27,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.population.redistribution import global_positions
 from blitzgs.runs.checkpoint_files import DAMAGE, Manifest, Shard, finish, opened, verified, write_shard
 from blitzgs.util.errors import UserError, warn
-from blitzgs.util.output import check_space, explain, is_lack_of_space
+from blitzgs.util.output import is_lack_of_space
 
 T = TypeVar("T")
 
@@ -111,7 +112,6 @@ class Saving:
     ) -> tuple[Shard, Shard | None]:
         """Write this rank's files, and return them."""
         self._folder.mkdir(parents=True, exist_ok=True)
-        check_space(self._folder, columns)
         file = f"shard_{self._ranks.rank:04d}_of_{self._ranks.world_size:04d}.safetensors"
         # On a stream of its own, copies to the host wait for no later work.
         with torch.cuda.stream(None if ready is None else torch.cuda.Stream(device)):
@@ -135,7 +135,7 @@ class Saving:
             with ranks.watchdog.working("writing a checkpoint"):
                 mine, common = self._written.result()
         except OSError as error:
-            problem = f"rank {ranks.rank} could not write: {explain(error)}"
+            problem = f"rank {ranks.rank} could not write: {_explain(error)}"
             lacks_space = is_lack_of_space(error)
         results = ranks.all_gather_object((mine, problem, lacks_space))
         problems = [text for _, text, _ in results if text]
@@ -146,7 +146,7 @@ class Saving:
                     shards = [shard for shard, _, _ in results if shard]
                     finish(self._folder, path, Manifest(shards, common, self._state))
             except OSError as error:
-                problems.append(f"rank 0 could not write: {explain(error)}")
+                problems.append(f"rank 0 could not write: {_explain(error)}")
                 lacks_space = is_lack_of_space(error)
         problems, lacks_space = ranks.broadcast_object((problems, lacks_space))
         if problems:
@@ -256,6 +256,15 @@ def read_share(path: Path, shards: list[Shard], ranks: Ranks, device: torch.devi
                 column = columns.setdefault(name, part.new_empty((count, *part.shape[1:])))
                 column[target.to(device)] = part
     return columns
+
+
+def _explain(error: OSError) -> str:
+    """Return why a file was not written, and what to do where that is known."""
+    if is_lack_of_space(error):
+        return f"the disk is full ({error}); free some space or lower the number of checkpoints kept"
+    if error.errno == errno.EFBIG:
+        return f"a file is larger than is allowed ({error}); raise the limit (ulimit -f) or use another disk"
+    return str(error)
 
 
 def _delete_old(directory: Path, keep: int) -> Thread:

@@ -8,9 +8,11 @@ be expensive.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -23,6 +25,7 @@ from safetensors import safe_open
 from torch import Tensor
 
 from blitzgs.util.output import sync_to_disk
+from blitzgs.util.terminal import amount
 
 FORMAT = 2
 MANIFEST = "manifest.json"
@@ -125,7 +128,7 @@ _CHUNK_BYTES = 64 << 20
 def write_shard(path: Path, columns: Mapping[str, Tensor]) -> tuple[int, str]:
     """Write and sync columns, on any device; return the size in bytes and the SHA-256 in hexadecimal.
 
-    ValueError: a column has a dtype that the format lacks.
+    ValueError: a column has a dtype that the format lacks. OSError: also if the free space is too small.
     """
     # Widest elements first, so that every column starts at a multiple of its element size.
     names = sorted(columns, key=lambda name: (-columns[name].element_size(), name))
@@ -141,6 +144,10 @@ def write_shard(path: Path, columns: Mapping[str, Tensor]) -> tuple[int, str]:
             "data_offsets": [offset, end],
         }
         offset = end
+    free = shutil.disk_usage(path.parent).free
+    if free < offset:
+        text = f"{amount(offset)} are needed and {amount(free)} are free"
+        raise OSError(errno.ENOSPC, text, str(path.parent))
     head = json.dumps(header).encode()
     head += b" " * (-len(head) % 8)
     digest = hashlib.sha256()
