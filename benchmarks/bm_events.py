@@ -33,7 +33,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs.log import RunLog
-from blitzgs.runs.run_files import Progress
+from blitzgs.runs.trained_model import Progress
 from blitzgs.table.blocks import morton_order, sort_rows
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.events import densify

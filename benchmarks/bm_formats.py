@@ -27,8 +27,9 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import Gaussians
 from blitzgs.formats.models import FORMATS, read_gaussians
 from blitzgs.runs.evaluation import _psnr
-from blitzgs.runs.export import export, source_of
+from blitzgs.runs.export import export
 from blitzgs.runs.folder import open_run
+from blitzgs.runs.source import source_of
 from blitzgs.runs.world import trained_columns
 from blitzgs.table.table import PARAMETERS
 from tests.helpers import read_glb

@@ -18,7 +18,6 @@ Into the folder go a chart of the popping (popping.svg) and the clip (popping.mp
 
 from __future__ import annotations
 
-import math
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -34,12 +33,13 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.frame.render import RenderOptions, render_frame
 from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.projection_types import Views
-from blitzgs.runs import run_files
+from blitzgs.runs import trained_model
 from blitzgs.runs.cameras import load_cameras
-from blitzgs.runs.run_files import MOST_KEPT, TrainedModel, level_fork
+from blitzgs.runs.trained_model import MOST_KEPT, TrainedModel
 from blitzgs.table.table import GaussianTable
 from blitzgs.util.charts import line_chart
 from blitzgs.view.gate import LodGate, ModelGate, centres_of
+from blitzgs.view.levels import level_fork
 from blitzgs.view.views import CameraLike, ViewSet, render_options
 from blitzgs.viewer.film import new_film
 
@@ -51,7 +51,7 @@ FARTHEST, NEAREST = 4.0, 0.5
 def popping(run: Path, out: Path | None = None, device: str = "cpu", **options: Any) -> dict[str, Any]:
     """Measure the popping of the model of a run: as `popping_of`, on a device."""
     ranks = Ranks(device=torch.device(device))
-    return popping_of(run_files.open_model(run, ranks), load_cameras(run).cameras, ranks, out, **options)
+    return popping_of(trained_model.open_model(run, ranks), load_cameras(run).cameras, ranks, out, **options)
 
 
 @torch.no_grad()
@@ -166,7 +166,7 @@ def _gate(model: TrainedModel, smooth: bool, ranks: Ranks) -> ModelGate:
     count = progress.level_count
     finest = count - 1 if progress.finest_level is None else progress.finest_level
     gate = LodGate(progress.reference_distance, level_fork(config), count, finest, smooth)
-    return ModelGate(gate, math.inf if smooth else MOST_KEPT, model.table, ranks)
+    return ModelGate(gate, MOST_KEPT, model.table, ranks)
 
 
 def _flight(

@@ -30,8 +30,8 @@ from quality_run import describe, means_of, write
 
 from blitzgs.config.fields import Config
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs.log import LOG
-from blitzgs.runs.run_files import TrainedModel
+from blitzgs.runs.run_files import LOG
+from blitzgs.runs.trained_model import TrainedModel
 from blitzgs.training.agreement import Agreement
 from blitzgs.training.events.evaluate import measure
 from blitzgs.training.inputs import open_capture, read_ahead

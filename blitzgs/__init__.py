@@ -38,28 +38,25 @@ __all__ = [
     "spherical_harmonics",
 ]
 
+# Loaded on first use: `blitzgs --help` and the synthetic city need no kernels.
 _MODULES = {
-    "contributions": "blitzgs.call",
-    "knn": "blitzgs.call.gaussians",
-    "l1_ssim": "blitzgs.call.gaussians",
-    "morton_order": "blitzgs.table.blocks",
-    "open_run": "blitzgs.runs.folder",
-    "position_noise": "blitzgs.call.gaussians",
-    "quat_scale_to_covar_preci": "blitzgs.call.gaussians",
-    "rasterization": "blitzgs.call",
-    "rasterize_contributing_gaussian_ids": "blitzgs.call.contributors",
-    "rasterize_num_contributing_gaussians": "blitzgs.call.contributors",
-    "rasterize_top_contributing_gaussian_ids": "blitzgs.call.contributors",
-    "raw_rasterization": "blitzgs.call",
-    "relocate": "blitzgs.call.gaussians",
-    "spherical_harmonics": "blitzgs.ops.harmonics",
+    "blitzgs.call": ("contributions", "rasterization", "raw_rasterization"),
+    "blitzgs.call.contributors": (
+        "rasterize_contributing_gaussian_ids",
+        "rasterize_num_contributing_gaussians",
+        "rasterize_top_contributing_gaussian_ids",
+    ),
+    "blitzgs.call.gaussians": ("knn", "l1_ssim", "position_noise", "quat_scale_to_covar_preci", "relocate"),
+    "blitzgs.ops.harmonics": ("spherical_harmonics",),
+    "blitzgs.runs.folder": ("open_run",),
+    "blitzgs.table.blocks": ("morton_order",),
 }
 
 
 def __getattr__(name: str) -> Any:
-    # Loaded on first use: `blitzgs --help` and the synthetic city need no kernels.
     if name == "optim":
         return import_module("blitzgs.optim")
-    if name in _MODULES:
-        return getattr(import_module(_MODULES[name]), name)
+    for module, names in _MODULES.items():
+        if name in names:
+            return getattr(import_module(module), name)
     raise AttributeError(f"module 'blitzgs' has no attribute {name!r}")

@@ -25,8 +25,9 @@ from blitzgs.formats.models import FORMATS
 from blitzgs.ops.photometric import report_
 from blitzgs.reference import ReferenceImage, render
 from blitzgs.runs.checkpoint import Saving
-from blitzgs.runs.export import Exported, export, source_of
+from blitzgs.runs.export import Exported, export
 from blitzgs.runs.folder import Model
+from blitzgs.runs.source import source_of
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors", "viewmats")
 

@@ -46,7 +46,7 @@ from blitzgs.capture.image_files import (
 from blitzgs.capture.masks import FileCheck, misfit
 from blitzgs.capture.shared_images import SharedImages
 from blitzgs.formats import native
-from blitzgs.util.errors import located
+from blitzgs.util.errors import UserError, located
 from blitzgs.util.terminal import amount
 
 K = TypeVar("K")
@@ -124,7 +124,7 @@ class BoundedCache(Generic[K, V]):
                 self.bytes -= self._entries.popitem(last=False)[1][1]
 
 
-class PhotographError(RuntimeError):
+class PhotographError(UserError):
     """A photograph cannot be read; the message names the file."""
 
 

@@ -41,16 +41,13 @@ blitzgs train --help explains the training; blitzgs train --help FIELD explains 
 # For each command the module, with the function that adds it if that is not `add_to`, and what it does.
 COMMANDS = {
     "sfm": ("blitzgs.cli.sfm", "find out where photographs were taken from, and write a capture"),
-    "refine": (
-        "blitzgs.cli.sfm:add_refine",
-        "find lenses and poses of a capture anew, for sharper models",
-    ),
+    "refine": ("blitzgs.cli.sfm:add_refine", "find lenses and poses of a capture anew, for sharper models"),
     "train": ("blitzgs.cli.train", "train a model of photographs with known cameras"),
     "eval": ("blitzgs.cli.evaluate", "measure PSNR and SSIM of a run's held-out views"),
     "render": ("blitzgs.cli.render", "render views of a model to pictures, or a path to a film"),
     "view": ("blitzgs.cli.view", "look at a model in the browser"),
-    "report": ("blitzgs.cli.view:add_report", "write the report of a run"),
-    "compare": ("blitzgs.cli.view:add_compare", "put runs side by side"),
+    "report": ("blitzgs.cli.report", "write the report of a run"),
+    "compare": ("blitzgs.cli.report:add_compare", "put runs side by side"),
     "export": ("blitzgs.cli.export", "write a model as PLY, SOG, SPZ, GLB ..., or as one HTML file to send"),
     "align": ("blitzgs.cli.align", "find out where a model lies in the world: control points, GPS, a CRS"),
     "gate": ("blitzgs.cli.gate", "fit and evaluate spawn gates, which make smaller models"),
@@ -61,20 +58,6 @@ COMMANDS = {
         "make a synthetic city: photographs, cameras and points to train on",
     ),
 }
-
-# Errors that a user can cause and correct: they are reported as a message. Any other error is a fault of the
-# program and keeps its traceback. The second part is imported only when an error is to be judged.
-_USER_ERRORS: tuple[type[BaseException], ...] = (ValueError, OSError, ImportError, MemoryError)
-_NAMED_ERRORS = (
-    "blitzgs.capture.images.PhotographError",
-    "blitzgs.distributed.group.MismatchError",
-    "blitzgs.runs.checkpoint.CheckpointError",
-    "blitzgs.runs.folder_checks.FolderError",
-    "blitzgs.runs.guard.ModelLostError",
-    "blitzgs.runs.guard.NonFiniteError",
-    "blitzgs.table.host_table.HostMemoryError",
-    "blitzgs.table.pool.PoolError",
-)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -111,17 +94,20 @@ def _run(given: list[str]) -> int:
             parser.print_help(sys.stderr)
             return 2
         args = _arguments(parser, command, chosen, given)
-        return cast(Callable[[argparse.Namespace], int], args.run)(args)
+        return cast(Callable[[argparse.Namespace], int | None], args.run)(args) or 0
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         return 130
     except Exception as error:
-        if not isinstance(error, _user_errors()):
+        from rich.console import Console
+
+        from blitzgs.util.errors import UserError
+
+        # Any other error is a fault of the program and keeps its traceback.
+        if not isinstance(error, (ValueError, OSError, ImportError, MemoryError, UserError)):
             raise
         # Those of Python's imports and of YAML have lines.
         lines = isinstance(error, ImportError) or type(error).__name__ == "ConfigError"
-        from rich.console import Console
-
         text = f"{name}: {printable(_message(error), lines)}"
         console = Console(stderr=True, highlight=False, emoji=False)
         console.print(text, style="red", markup=False, soft_wrap=True)
@@ -187,11 +173,6 @@ def _importing(name: str) -> Iterator[None]:
         gc.enable()
         if usual:
             signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def _user_errors() -> tuple[type[BaseException], ...]:
-    named = (path.rpartition(".") for path in _NAMED_ERRORS)
-    return (*_USER_ERRORS, *(getattr(import_module(module), name) for module, _, name in named))
 
 
 def _message(error: BaseException) -> str:

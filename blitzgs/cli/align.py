@@ -61,8 +61,8 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     add_capture(parser)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Align a run; returns the exit status."""
+def run(args: argparse.Namespace) -> None:
+    """Align a run."""
     run_files.check_is_run(args.folder)
     if not (args.gcp or args.gps or args.crs):
         args.parser.error("one of the arguments --gcp, --gps, --crs is required")
@@ -76,7 +76,6 @@ def run(args: argparse.Namespace) -> int:
     _warn_if_turned_over(frame, capture)
     path = save_world_frame(args.folder, frame)
     print(f"{path}: {printable(frame.name)}, scale {frame.scale:.9g}")
-    return 0
 
 
 def _capture(args: argparse.Namespace) -> Capture:

@@ -27,12 +27,12 @@ Commands = argparse._SubParsersAction  # argparse has no public name for it
 def add_command(
     commands: Commands[argparse.ArgumentParser],
     name: str,
-    function: Callable[[argparse.Namespace], int],
+    function: Callable[[argparse.Namespace], int | None],
     summary: str,
     description: str | None = None,
     add_help: bool = True,
 ) -> argparse.ArgumentParser:
-    """Add a command that calls `function` with its arguments and exits with what it returns.
+    """Add a command that calls `function` with its arguments and exits with what it returns, or 0.
 
     Without `add_help`, the caller adds the flag --help.
     """
@@ -233,7 +233,7 @@ def flags_of(parser: argparse.ArgumentParser) -> dict[str, bool]:
 def flag_meant(parser: argparse.ArgumentParser, text: str) -> str | None:
     """Return the command's flag that an unknown one resembles; None for a field and if no flag is like it."""
     name = text.partition("=")[0]
-    flags = re.findall(r"--[\w-]+", parser.format_usage())
+    flags = list(flags_of(parser))
     if not name.startswith("--") or "." in name:
         return None
     if len(longer := [flag for flag in flags if flag.startswith(name)]) == 1:

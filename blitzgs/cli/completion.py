@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from typing import NamedTuple
 
 from blitzgs.cli import COMMANDS, parser_of
 from blitzgs.cli.arguments import Commands, add_command
@@ -42,36 +41,29 @@ complete -o default -F _blitzgs blitzgs
 """
 
 
-class Flag(NamedTuple):
-    """A flag of a command."""
-
-    name: str  # with its dashes
-    takes_value: bool
-    choices: list[str]  # where the values are few
-    help: str
-
-
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = add_command(commands, "completion", run, summary, HELP)
     parser.add_argument("shell", metavar="SHELL", choices=("bash", "zsh", "fish"))
 
 
-def run(args: argparse.Namespace) -> int:
-    """Print the script; returns the exit status."""
+def run(args: argparse.Namespace) -> None:
+    """Print the script."""
     print(script(args.shell))
-    return 0
 
 
 def script(shell: str) -> str:
     """Return the script for a shell."""
-    commands = collect()
+    commands = parser_of(COMMANDS)[1]
+    for field in flat(to_dict(Config())):
+        commands["train"].add_argument(f"--{field}", help="a field")
     if shell == "fish":
-        return "\n".join(_fish(commands))
+        return "\n".join(line for name, parser in commands.items() for line in _fish(name, parser))
     flags, choices = [], []
-    for name, (words, its_flags) in commands.items():
-        flags.append(f"      {name}) flags='{' '.join(flag.name for flag in its_flags)}' ;;")
-        after = {flag.name: flag.choices for flag in its_flags} | {name: words}
+    for name, parser in commands.items():
+        words, actions = _after(parser)
+        flags.append(f"      {name}) flags='{' '.join(actions)}' ;;")
+        after = {flag: _choices(action) for flag, action in actions.items()} | {name: words}
         choices += [
             f"      '{name} {before}') words='{' '.join(few)}' ;;" for before, few in after.items() if few
         ]
@@ -80,40 +72,35 @@ def script(shell: str) -> str:
     return text if shell == "bash" else f"autoload -U +X bashcompinit && bashcompinit\n{text}"
 
 
-def collect() -> dict[str, tuple[list[str], list[Flag]]]:
-    """Return the words that may follow each command, such as `fit` after `gate`, and its flags."""
-    found: dict[str, tuple[list[str], list[Flag]]] = {}
-    for name, parser in parser_of(COMMANDS)[1].items():
-        words: list[str] = []
-        parsers: list[argparse.ArgumentParser] = [parser]
-        for action in parser._actions:  # argparse has no public list of them
-            if isinstance(action, argparse._SubParsersAction):
-                parsers += action.choices.values()
-            if not action.option_strings:
-                words += map(str, action.choices or ())
-        flags = {flag.name: flag for each in parsers for flag in _flags(each)}
-        found[name] = words, list(flags.values())
-    found["train"][1].extend(Flag(f"--{name}", True, [], "a field") for name in flat(to_dict(Config())))
-    return found
+def _after(parser: argparse.ArgumentParser) -> tuple[list[str], dict[str, argparse.Action]]:
+    """Return the words that may follow a command, such as `fit` after `gate`, and its flags."""
+    words: list[str] = []
+    flags: dict[str, argparse.Action] = {}
+    for action in parser._actions:  # argparse has no public list of them
+        if not action.option_strings:
+            words += _choices(action)
+        if isinstance(action, argparse._SubParsersAction):
+            for each in action.choices.values():
+                flags |= _after(each)[1]
+        flags |= {flag: action for flag in action.option_strings if flag.startswith("--")}
+    return words, flags
 
 
-def _flags(parser: argparse.ArgumentParser) -> Iterator[Flag]:
-    for action in parser._actions:
-        for name in action.option_strings:
-            if name.startswith("--"):
-                choices = [str(choice) for choice in action.choices or ()]
-                yield Flag(name, action.nargs != 0, choices, (action.help or "").partition(";")[0])
+def _choices(action: argparse.Action) -> list[str]:
+    return [str(choice) for choice in action.choices or ()]
 
 
-def _fish(commands: dict[str, tuple[list[str], list[Flag]]]) -> Iterator[str]:
-    for name, (words, flags) in commands.items():
-        yield f"complete -c blitzgs -n __fish_use_subcommand -f -a {name} -d {_quoted(COMMANDS[name][1])}"
-        used = f"complete -c blitzgs -n '__fish_seen_subcommand_from {name}'"
-        if words:
-            yield f"{used} -f -a {_quoted(' '.join(words))}"
-        for flag in flags:
-            value = f" -x -a {_quoted(' '.join(flag.choices))}" if flag.choices else " -r" * flag.takes_value
-            yield f"{used} -l {flag.name[2:]}{value} -d {_quoted(flag.help.replace('%', ''))}"
+def _fish(name: str, parser: argparse.ArgumentParser) -> Iterator[str]:
+    yield f"complete -c blitzgs -n __fish_use_subcommand -f -a {name} -d {_quoted(COMMANDS[name][1])}"
+    used = f"complete -c blitzgs -n '__fish_seen_subcommand_from {name}'"
+    words, flags = _after(parser)
+    if words:
+        yield f"{used} -f -a {_quoted(' '.join(words))}"
+    for flag, action in flags.items():
+        few = _choices(action)
+        value = f" -x -a {_quoted(' '.join(few))}" if few else " -r" * (action.nargs != 0)
+        meaning = (action.help or "").partition(";")[0].replace("%", "")
+        yield f"{used} -l {flag[2:]}{value} -d {_quoted(meaning)}"
 
 
 def _quoted(text: str) -> str:

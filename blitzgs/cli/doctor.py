@@ -8,7 +8,6 @@ It works without torch and with libraries that do not load: what may fail runs i
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import os
 import platform
@@ -21,14 +20,13 @@ import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from blitzgs import __version__
-from blitzgs._built import LIBRARY_DIR
 from blitzgs.cli.arguments import Commands, add_command, add_flags
+from blitzgs.cli.doctor_probes import REINSTALL, REPORT, found
 
 HELP = """\
 Check this installation: torch, the GPUs, the libraries, optional packages, and small renderings that are
@@ -47,18 +45,12 @@ FLAGS = """
 --json  print the report as JSON
 --folder DIR  measure the disk of this folder too, with a file of 64 MB that is removed
 """
-State = Literal["ok", "warning", "missing", "failed"]
 _PACKAGE = Path(__file__).resolve().parents[1]
-# The largest errors of the small rendering in float32, and of its gradients relative to the largest of each.
-_IMAGE_ERROR, _GRADIENT_ERROR = 1e-5, 1e-3
-_SLOW_DISK_MB_S = 50
 TIMEOUT = 120.0  # seconds of each test
 _LITTLE_MEMORY = 4 << 30
 _NOT_FOR_USERS = ("test", "lint", "docs", "all")
 _LOCAL = "allow connections to 127.0.0.1; until then train with one process"
 _NCCL = "NCCL_DEBUG=WARN blitzgs doctor"
-_REPORT = "report this with `blitzgs doctor --json`"
-_REINSTALL = "pip install --force-reinstall --no-deps blitzgs (in a checkout: make build)"
 
 
 @dataclass
@@ -66,7 +58,7 @@ class Line:
     """A line of the report."""
 
     name: str  # what was looked at
-    state: State  # see `HELP`
+    state: str  # "ok", "warning", "missing" or "failed", see `HELP`
     text: str  # what was found
     remedy: str = ""  # what mends it; "": nothing has to be mended
     required: bool = True  # BlitzGS cannot do without it
@@ -103,25 +95,25 @@ def examine(folder: Path | None = None) -> list[Line]:
     lines = [Line("blitzgs", "ok", f"{__version__} in {_PACKAGE}"), _system(), _memory(), *_packages()]
     torch_line = _torch()
     gpus = torch_line.values.get("gpus", [])
-    lines += [
-        torch_line,
-        _looked("driver", "restart the machine, or install the driver again", False, _driver),
-    ]
+    driver = _looked("driver", "restart the machine, or install the driver again", False, _driver)
+    lines += [torch_line, driver]
     lines += [*(_gpu(number, gpu) for number, gpu in enumerate(gpus)), _looked("nvcc", "", False, _nvcc)]
     works = torch_line.state in ("ok", "warning")
-    checks: list[tuple[str, str, bool, Callable[[], Line]]] = []
-    checks.append(("lib io", _REINSTALL, True, partial(_library, "io")))
+    # Each with what mends a look that fails, whether it is required, the look and its arguments.
+    checks: list[tuple[Any, ...]] = [("lib io", REINSTALL, True, probe, "library", "io")]
     if works:
-        backends = ["cpu", *(["cuda"] if gpus else [])]
-        checks += [(f"lib {name}", _REINSTALL, True, partial(_library, name, gpus)) for name in backends]
-        checks += [(f"render {name}", _REINSTALL, True, partial(_render, name)) for name in backends]
-        checks.append(("exchange Gloo", _LOCAL, False, partial(_exchange, "cpu")))
-        if gpus:
-            several = len(gpus) > 1
-            remedy, nccl = (_LOCAL, partial(_exchange, "cuda")) if several else (_NCCL, _nccl)
-            checks.append(("exchange NCCL", remedy, False, nccl))
+        backends, architectures = ["cpu", *(["cuda"] if gpus else [])], [gpu["architecture"] for gpu in gpus]
+        checks += [
+            (f"lib {name}", REINSTALL, True, probe, "library", name, *architectures) for name in backends
+        ]
+        checks += [(f"render {name}", REINSTALL, True, probe, "render", name) for name in backends]
+        checks.append(("exchange Gloo", _LOCAL, False, _exchange, "cpu"))
+        if len(gpus) > 1:
+            checks.append(("exchange NCCL", _LOCAL, False, _exchange, "cuda"))
+        elif gpus:
+            checks.append(("exchange NCCL", _NCCL, False, probe, "nccl", _free_port()))
     if folder is not None:
-        checks.append(("disk", "choose a folder that can be written", False, partial(_disk, folder)))
+        checks.append(("disk", "choose a folder that can be written", False, probe, "disk", str(folder)))
     with ThreadPoolExecutor(2) as pool:
         lines += pool.map(lambda check: _looked(*check), checks)
     if not works:
@@ -129,10 +121,12 @@ def examine(folder: Path | None = None) -> list[Line]:
     return lines
 
 
-def _looked(name: str, remedy: str, required: bool, look: Callable[[], Line]) -> Line:
-    """Return what a look finds; a probe that fails is a line too."""
+def _looked(
+    name: str, remedy: str, required: bool, look: Callable[..., dict[str, Any]], *arguments: str
+) -> Line:
+    """Return the line of what a look finds; a look that fails is a line too."""
     try:
-        return look()
+        return Line(name, required=required, **look(*arguments))
     except ProbeError as error:
         return Line(name, "failed", str(error), remedy, required)
 
@@ -142,46 +136,33 @@ def probe(name: str, *arguments: str) -> dict[str, Any]:
     command = [sys.executable, "-m", "blitzgs.cli.doctor_probes", name, *arguments]
     output = run_command(command)
     try:
-        found: dict[str, Any] = json.loads(output.splitlines()[-1])
+        result: dict[str, Any] = json.loads(output.splitlines()[-1])
     except (IndexError, ValueError) as error:
         raise ProbeError(f"printed no result: {output[-200:]!r}") from error
-    return found
+    return result
 
 
 def run_command(command: Sequence[str]) -> str:
-    """Run a command, with all processes that it starts, and return its standard output.
+    """Run a command and return its standard output.
 
     ProbeError: it cannot be started, failed, was killed or took longer than `TIMEOUT`.
     """
     path = os.pathsep.join(filter(None, [str(_PACKAGE.parent), os.environ.get("PYTHONPATH")]))
+    environment = os.environ | {"PYTHONPATH": path}
     try:
-        process = subprocess.Popen(
-            command,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            errors="replace",
-            env=os.environ | {"PYTHONPATH": path},
-            start_new_session=True,
+        done = subprocess.run(
+            command, capture_output=True, text=True, errors="replace", env=environment, timeout=TIMEOUT
         )
     except OSError as error:
         raise ProbeError(f"{command[0]}: {error.strerror}") from error
-    try:
-        output, errors = process.communicate(timeout=TIMEOUT)
     except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
         raise ProbeError(f"no answer within {TIMEOUT:g} s") from None
-    if process.returncode < 0:
-        raise ProbeError(f"ended by {signal.Signals(-process.returncode).name}: {_last(errors)}")
-    if process.returncode:
-        raise ProbeError(_last(errors) or f"exit status {process.returncode}")
-    return output
-
-
-def _last(errors: str) -> str:
-    lines = [line.strip() for line in errors.splitlines() if line.strip()]
-    return lines[-1][:300] if lines else ""
+    last = done.stderr.strip().rpartition("\n")[2].strip()[:300]
+    if done.returncode < 0:
+        raise ProbeError(f"ended by {signal.Signals(-done.returncode).name}: {last}")
+    if done.returncode:
+        raise ProbeError(last or f"exit status {done.returncode}")
+    return done.stdout
 
 
 def _system() -> Line:
@@ -208,9 +189,7 @@ def _memory() -> Line:
 
 def _packages() -> list[Line]:
     """Return a line for each package that BlitzGS needs (but torch), and for each of the extras."""
-    try:
-        wanted = metadata.requires("blitzgs") or []
-    except metadata.PackageNotFoundError:
+    if not (wanted := _requirements()):
         return [Line("packages", "warning", "blitzgs is not installed as a package", "pip install .", False)]
     lines = []
     for requirement in wanted:
@@ -227,18 +206,12 @@ def _packages() -> list[Line]:
     return lines
 
 
-def _torch_bounds() -> dict[str, str]:
-    """Return the lowest torch that BlitzGS works with (">="), and the first that is not tested ("<").
-
-    A bound that the installed package does not state is absent.
-    """
+def _requirements() -> list[str]:
+    """Return what the installed package requires; empty: there is none."""
     try:
-        wanted = metadata.requires("blitzgs") or []
+        return metadata.requires("blitzgs") or []
     except metadata.PackageNotFoundError:
-        wanted = []
-    torch = next((text for text in wanted if re.match(r"torch\b", text)), "")
-    found = dict(re.findall(r"(>=|<)\s*([\d.]+)", torch))
-    return {sign: found[sign] for sign in (">=", "<") if sign in found}
+        return []
 
 
 def _version(text: str) -> tuple[int, ...]:
@@ -246,7 +219,9 @@ def _version(text: str) -> tuple[int, ...]:
 
 
 def _torch() -> Line:
-    bounds = _torch_bounds()
+    # The lowest that works, and the first that is not tested, where the installed package states them.
+    wanted = next((text for text in _requirements() if re.match(r"torch\b", text)), "")
+    bounds = dict(sorted(re.findall(r"(>=|<)\s*([\d.]+)", wanted), reverse=True))
     limits = ",".join(f"{sign}{version}" for sign, version in bounds.items())
     install = f"pip install 'torch{limits}'" if bounds else "pip install torch"
     try:
@@ -265,12 +240,12 @@ def _torch() -> Line:
     return Line("torch", "ok", text, values=found)
 
 
-def _driver() -> Line:
+def _driver() -> dict[str, Any]:
     query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
     if shutil.which("nvidia-smi") is None:
-        return Line("driver", "missing", "no NVIDIA driver: BlitzGS trains on the CPU", "", False)
+        return found("missing", "no NVIDIA driver: BlitzGS trains on the CPU")
     version = run_command(query).split("\n")[0]
-    return Line("driver", "ok", f"NVIDIA {version}", "", False)
+    return found("ok", f"NVIDIA {version}")
 
 
 def _gpu(number: int, gpu: dict[str, Any]) -> Line:
@@ -280,74 +255,25 @@ def _gpu(number: int, gpu: dict[str, Any]) -> Line:
     return Line(f"GPU {number}", "ok", text, "", False, gpu)
 
 
-def _nvcc() -> Line:
+def _nvcc() -> dict[str, Any]:
     if shutil.which("nvcc") is None:
-        return Line("nvcc", "missing", "only needed to build the CUDA library from the sources", "", False)
-    found = re.search(r"release [\d.]+", run_command(["nvcc", "--version"]))
-    return Line("nvcc", "ok", found[0] if found else "", "", False)
+        return found("missing", "only needed to build the CUDA library from the sources")
+    release = re.search(r"release [\d.]+", run_command(["nvcc", "--version"]))
+    return found("ok", release[0] if release else "")
 
 
-def _library(name: str, gpus: Sequence[dict[str, Any]] = ()) -> Line:
-    path = LIBRARY_DIR / f"libblitzgs_{name}.so"
-    line = f"lib {name}"
-    if not path.exists():
-        return Line(line, "missing", str(path), _REINSTALL)
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
-    text = f"{path.stat().st_size / 1e6:.1f} MB, sha256 {digest}"
-    found = probe("library", name)
-    if "cuda" in found:
-        text += f", CUDA {found['cuda']} for {found['architectures']}"
-        native = [gpu["architecture"].removeprefix("sm_") for gpu in gpus]
-        foreign = [arch for arch in native if arch not in re.split(r"\D+", found["architectures"])]
-        if foreign and found["architectures"] != "native":
-            remedy = "the driver compiles the kernels at the first use; to avoid it: make build"
-            return Line(line, "warning", f"{text}, not for sm_{foreign[0]}", remedy, values=found)
-    return Line(line, "ok", text, values=found | {"sha256": digest})
-
-
-def _render(device: str) -> Line:
-    found = probe("render", device)
-    good = found["image_error"] <= _IMAGE_ERROR and found["gradient_error"] <= _GRADIENT_ERROR
-    text = (
-        f"error of the image {found['image_error']:.1e}, of gradients {found['gradient_error']:.1e} "
-        f"({found['seconds']:.1f} s)"
-    )
-    remedy = "" if good else _REPORT
-    return Line(f"render {device}", "ok" if good else "failed", text, remedy, values=found)
-
-
-def _exchange(device: str) -> Line:
+def _exchange(device: str) -> dict[str, Any]:
     """Let two processes render together."""
     port = _free_port()
-    name = "exchange " + ("Gloo" if device == "cpu" else "NCCL")
     with ThreadPoolExecutor(2) as pool:
-        found = list(pool.map(lambda rank: probe("exchange", device, rank, port), "01"))
-    good = all(part["differing_values"] == 0 and part["covered"] > 0.1 for part in found)
-    text = f"two ranks, {found[0]['backend']}: " + (
-        "the bits of one" if good else "another image than one rank's"
-    )
-    remedy = "" if good else _REPORT
-    return Line(name, "ok" if good else "failed", text, remedy, False, {"ranks": found})
-
-
-def _nccl() -> Line:
-    good = probe("nccl", _free_port())["sum"] == 28.0
-    text = "one GPU: it sums" if good else "one GPU: a wrong sum"
-    return Line("exchange NCCL", "ok" if good else "failed", text, "", False)
+        parts = list(pool.map(lambda rank: probe("exchange", device, rank, port), "01"))
+    what = f"two ranks, {parts[0]['backend']}"
+    if all(part["differing_values"] == 0 and part["covered"] > 0.1 for part in parts):
+        return found("ok", f"{what}: the bits of one", ranks=parts)
+    return found("failed", f"{what}: another image than one rank's", REPORT, ranks=parts)
 
 
 def _free_port() -> str:
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         return str(listener.getsockname()[1])
-
-
-def _disk(folder: Path) -> Line:
-    found = probe("disk", str(folder))
-    slow = min(found["write_mb_s"], found["read_mb_s"]) < _SLOW_DISK_MB_S
-    text = (
-        f"{folder}: writes {found['write_mb_s']:.0f} and reads {found['read_mb_s']:.0f} MB/s, "
-        f"{found['free_bytes'] / 1e9:.0f} GB free"
-    )
-    remedy = "keep captures and runs on a local disk" if slow else ""
-    return Line("disk", "warning" if slow else "ok", text, remedy, False, found)

@@ -6,12 +6,15 @@ Each probe prints one line of JSON: `python -m blitzgs.cli.doctor_probes NAME AR
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import re
+import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -19,8 +22,18 @@ if TYPE_CHECKING:
 
     from blitzgs.reference.render import ReferenceImage
 
+
+REPORT = "report this with `blitzgs doctor --json`"
+REINSTALL = "pip install --force-reinstall --no-deps blitzgs (in a checkout: make build)"
 _WIDTH, _HEIGHT, _COUNT = 48, 32, 60
-_DISK_BYTES = 64 << 20
+# The largest errors of the small rendering in float32, and of its gradients relative to the largest of each.
+_IMAGE_ERROR, _GRADIENT_ERROR = 1e-5, 1e-3
+_DISK_BYTES, _SLOW_DISK_MB_S = 64 << 20, 50
+
+
+def found(state: str, text: str, remedy: str = "", **values: Any) -> dict[str, Any]:
+    """Return what a look finds; see `blitzgs.cli.doctor.Line`."""
+    return {"state": state, "text": text, "remedy": remedy, "values": values}
 
 
 def torch_() -> dict[str, Any]:
@@ -46,34 +59,50 @@ def torch_() -> dict[str, Any]:
     }
 
 
-def library(name: str) -> dict[str, Any]:
-    """Load a library; return the digest of its ops, and with which CUDA it was built."""
+def library(name: str, *architectures: str) -> dict[str, Any]:
+    """Load a library, and compare what it was built for with the GPUs' architectures."""
     import ctypes
 
     from blitzgs import _built
 
     path = _built.LIBRARY_DIR / f"libblitzgs_{name}.so"
+    if not path.exists():
+        return found("missing", str(path), REINSTALL)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    text = f"{path.stat().st_size / 1e6:.1f} MB, sha256 {digest}"
     if name == "io":
         from blitzgs.formats import native
 
-        return {"models": len(native.camera_models())}
+        return found("ok", text, sha256=digest, models=len(native.camera_models()))
     import torch
 
     torch.ops.load_library(str(path))
-    found = {"ops": _built.schema_digest(path)}
-    if _built.REGISTRATION.exists() and found["ops"] != _built.source_digest(_built.REGISTRATION):
+    ops = _built.schema_digest(path)
+    if _built.REGISTRATION.exists() and ops != _built.source_digest(_built.REGISTRATION):
         raise ImportError(
             f"{path} was built before the ops changed (it does not match csrc/registration.cpp)"
         )
-    if name == "cuda":
-        build = ctypes.CDLL(str(path)).blitzgs_cuda_build
-        build.restype = ctypes.c_char_p
-        found["cuda"], found["architectures"] = build().decode().split(" ")
-    return found
+    if name == "cpu":
+        return found("ok", text, sha256=digest, ops=ops)
+    build = ctypes.CDLL(str(path)).blitzgs_cuda_build
+    build.restype = ctypes.c_char_p
+    cuda, built = build().decode().split(" ")
+    text, values = f"{text}, CUDA {cuda} for {built}", {"cuda": cuda, "architectures": built, "ops": ops}
+    if others := foreign(built, architectures):
+        remedy = "the driver compiles the kernels at the first use; to avoid it: make build"
+        return found("warning", f"{text}, not for {others[0]}", remedy, **values)
+    return found("ok", text, sha256=digest, **values)
+
+
+def foreign(built: str, architectures: Sequence[str]) -> list[str]:
+    """Return the architectures that a library was not built for, of GPUs such as "sm_90"."""
+    if built == "native":
+        return []
+    return [name for name in architectures if name.removeprefix("sm_") not in re.split(r"\D+", built)]
 
 
 def render(device: str) -> dict[str, Any]:
-    """Render a small scene and differentiate it; return the largest errors against the float64 reference."""
+    """Render a small scene and differentiate it, and compare both with the float64 reference."""
     import torch
 
     tensors = [tensor.to(device).requires_grad_() for tensor in _scene()]
@@ -90,11 +119,16 @@ def render(device: str) -> dict[str, Any]:
     for ours, exact in zip(tensors, leaves, strict=True):
         assert ours.grad is not None and exact.grad is not None
         gradients.append((ours.grad.double().cpu() - exact.grad).abs().max() / exact.grad.abs().max())
-    return {
-        "image_error": float(image[~reference.cut].max()),
-        "gradient_error": float(max(gradients)),
-        "seconds": time.perf_counter() - begin,
-    }
+    seconds = time.perf_counter() - begin
+    return rendered(float(image[~reference.cut].max()), float(max(gradients)), seconds)
+
+
+def rendered(image_error: float, gradient_error: float, seconds: float) -> dict[str, Any]:
+    """Judge a rendering by its largest errors."""
+    good = image_error <= _IMAGE_ERROR and gradient_error <= _GRADIENT_ERROR
+    text = f"error of the image {image_error:.1e}, of gradients {gradient_error:.1e} ({seconds:.1f} s)"
+    state, remedy = ("ok", "") if good else ("failed", REPORT)
+    return found(state, text, remedy, image_error=image_error, gradient_error=gradient_error, seconds=seconds)
 
 
 def exchange(device: str, rank: str, port: str) -> dict[str, Any]:
@@ -130,11 +164,13 @@ def nccl(port: str) -> dict[str, Any]:
     torch.distributed.all_reduce(values)
     total = float(values.sum())
     torch.distributed.destroy_process_group()
-    return {"sum": total}
+    if total != 28.0:
+        return found("failed", "one GPU: a wrong sum")
+    return found("ok", "one GPU: it sums")
 
 
 def disk(folder: str) -> dict[str, Any]:
-    """Write and read a file; return megabytes a second."""
+    """Write and read a file."""
     data = os.urandom(1 << 20)
     with tempfile.TemporaryFile(dir=folder) as file:
         begin = time.perf_counter()
@@ -151,12 +187,16 @@ def disk(folder: str) -> dict[str, Any]:
         read = time.perf_counter()
     if count * len(data) != _DISK_BYTES:
         raise OSError(f"{folder}: what was written is not what is read")
-    room = os.statvfs(folder)
-    return {
-        "write_mb_s": _DISK_BYTES / (written - begin) / 1e6,
-        "read_mb_s": _DISK_BYTES / (read - written) / 1e6,
-        "free_bytes": room.f_bavail * room.f_frsize,
-    }
+    return measured(folder, _DISK_BYTES / (written - begin) / 1e6, _DISK_BYTES / (read - written) / 1e6)
+
+
+def measured(folder: str, write_mb_s: float, read_mb_s: float) -> dict[str, Any]:
+    """Judge a disk by its megabytes a second."""
+    free_bytes = shutil.disk_usage(folder).free
+    text = f"{folder}: writes {write_mb_s:.0f} and reads {read_mb_s:.0f} MB/s, {free_bytes / 1e9:.0f} GB free"
+    slow = min(write_mb_s, read_mb_s) < _SLOW_DISK_MB_S
+    state, remedy = ("warning", "keep captures and runs on a local disk") if slow else ("ok", "")
+    return found(state, text, remedy, write_mb_s=write_mb_s, read_mb_s=read_mb_s, free_bytes=free_bytes)
 
 
 def _generator() -> Any:

@@ -15,7 +15,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import Gaussians, is_antialiased
 from blitzgs.formats.models import read_gaussians
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs import run_files
+from blitzgs.runs import run_files, trained_model
 from blitzgs.runs.cameras import input_files, warn_of_changes
 from blitzgs.runs.evaluation import evaluate, load_lpips, worst_views
 from blitzgs.runs.world import check_seen, subject_of_file
@@ -61,8 +61,8 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
     parser.set_defaults(pictures=8)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Measure the views of a run; returns the exit status."""
+def run(args: argparse.Namespace) -> None:
+    """Measure the views of a run."""
     if args.pictures < 0:
         raise ValueError(f"--pictures: must be 0 or more, got {args.pictures}")
     with Ranks.from_environment(args.device, share_gpus=args.share_gpus) as ranks:
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
             if args.downscale is not None:
                 raise ValueError("--downscale is for a file: a run is measured at the size it was trained at")
             run_folder, checkpoint = run_files.run_and_checkpoint(path)
-            model = run_files.open_model(run_folder, ranks, args.data, args.resident_gb, checkpoint)
+            model = trained_model.open_model(run_folder, ranks, args.data, args.resident_gb, checkpoint)
             config = model.config
         if args.allow_missing:
             config = changed(config, "data", allow_missing=True)
@@ -113,7 +113,6 @@ def run(args: argparse.Namespace) -> int:
                 print(printable(f"among the worst views: {view} {psnr:.2f} dB"), file=sys.stderr)
             what = f"metrics.json and pictures of {len(indices)} views, {largest_size(capture)} pixels"
             print(f"{folder}: {what}", file=sys.stderr)
-    return 0
 
 
 def _config_of(found: Gaussians, data: Path | None, downscale: int | None) -> Config:

@@ -27,16 +27,14 @@ from blitzgs.runs.clean import cleaned
 from blitzgs.runs.export import (
     COORDINATES,
     Exported,
-    Watched,
     export,
     export_file,
     export_folder,
-    open_source,
-    source_of,
     without_antialiasing,
 )
 from blitzgs.runs.folder import Model, open_run, subject_of
 from blitzgs.runs.run_files import run_and_checkpoint
+from blitzgs.runs.source import Watched, open_source, source_of
 from blitzgs.runs.world import in_world, load_world_frame
 from blitzgs.util.output import write_file
 from blitzgs.util.progress import ending_by_exception, image_progress
@@ -151,17 +149,18 @@ def _add_selection(parser: argparse.ArgumentParser) -> None:
     arguments.add_flags(parser, SELECTION, {"--min-opacity": float, "--most": int, "--levels": _levels})
 
 
-def run(args: argparse.Namespace) -> int:
-    """Export a model; returns the exit status."""
+def run(args: argparse.Namespace) -> None:
+    """Export a model."""
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise ValueError("export writes one file from one process: run it without torchrun")
     if args.clean is None:
         _refuse(args, ("data",), "is for --clean, which compares with the photographs")
     with ending_by_exception():
         if args.tiles or args.streamed_sog:
-            return _export_tiles(args, _selection(args))
+            _export_tiles(args, _selection(args))
+            return
         _refuse(args, ("tile_gaussians", "processes", "spz_tiles"), f"is for {_TILES}")
-        return _export_html(args) if args.html else _export_file(args)
+        (_export_html if args.html else _export_file)(args)
 
 
 def _refuse(args: argparse.Namespace, flags: Iterable[str], reason: str) -> None:
@@ -171,7 +170,7 @@ def _refuse(args: argparse.Namespace, flags: Iterable[str], reason: str) -> None
             raise ValueError(f"--{flag.replace('_', '-')} {reason}")
 
 
-def _export_tiles(args: argparse.Namespace, selection: Selection | None) -> int:
+def _export_tiles(args: argparse.Namespace, selection: Selection | None) -> None:
     _refuse(args, ("max_mb", "coordinates", "classic", "clean"), f"is not for {_TILES}")
     if args.streamed_sog:
         _refuse(args, ("spz_tiles",), "is for --tiles")
@@ -207,10 +206,9 @@ def _export_tiles(args: argparse.Namespace, selection: Selection | None) -> int:
         print(f"coordinates are relative to ({x!r}, {y!r}, {z!r}), as {beside} says")
     if args.tiles and not args.spz_tiles:
         print(f"look at it: blitzgs view {shlex.quote(str(path))}")
-    return 0
 
 
-def _export_html(args: argparse.Namespace) -> int:
+def _export_html(args: argparse.Namespace) -> None:
     from blitzgs.viewer.studio import open_model
     from blitzgs.viewer.web import web_file
 
@@ -229,10 +227,9 @@ def _export_html(args: argparse.Namespace) -> int:
     print(f"{path}: {page.gaussians:,} of {page.of:,} Gaussians, {size:.1f} MB; open it in a browser")
     if page.left_out:
         print(page.left_out)
-    return 0
 
 
-def _export_file(args: argparse.Namespace) -> int:
+def _export_file(args: argparse.Namespace) -> None:
     _refuse(args, ("max_mb",), "is for --html; --most N limits other files")
     name = next(name for name in FORMATS if getattr(args, name.replace("-", "_")))
     kind, path = FORMATS[name], getattr(args, name.replace("-", "_"))
@@ -256,7 +253,6 @@ def _export_file(args: argparse.Namespace) -> int:
     for line in kind.unstated(source):
         print(line, file=sys.stderr)
     _explain(written, is_antialiased(source), kind, args)
-    return 0
 
 
 def _export_run(
@@ -313,9 +309,11 @@ def _cleaned(model: Model, folder: Path, args: argparse.Namespace, path: Path, r
     cameras = open_run(folder).cameras()
     found = cleaned(model, cameras, args.clean, ranks, photographs(folder, args.data))
     picture = path.with_name(path.name + ".clean.jpg")
-    found.write_picture(picture)
-    gone = len(model) - int(found.kept.sum())
-    print(f"--clean: {gone:,} of {len(model):,} Gaussians go" + (f", see {picture}" if gone else ""))
+    gone, shown = len(model) - int(found.kept.sum()), ""
+    if found.picture is not None:
+        write_file(picture, found.picture)
+        shown = f", see {picture}"
+    print(f"--clean: {gone:,} of {len(model):,} Gaussians go{shown}")
     if found.psnr is not None:
         before, after = found.psnr
         print(f"held-out PSNR: {before:.3f} dB before, {after:.3f} dB after")

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_flags, add_path
+from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_path
 from blitzgs.config.fields import ScheduleConfig
-from blitzgs.config.files import ConfigError, changed, load_config
+from blitzgs.config.files import changed
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import run_files
@@ -37,12 +37,6 @@ all births and deaths of Gaussians. The repository's docs/guide/fewer-gaussians.
 """
 
 
-FIT_FLAGS = """
---gate-from IMAGES  also evaluate separately the spawns (births during training) from this time on; take
-    schedule.gate_from times schedule.scale of the runs that will use the gate (default: %(default)s)
-"""
-
-
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     parser = add_command(commands, "gate", lambda _: 2, summary, HELP)
@@ -50,15 +44,19 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     fit = add_command(actions, "fit", run_fit, "fit a gate on the lineage of runs")
     add_path(fit, "runs", "RUN", "folder of a run with lineage, or a sample", nargs="+")
     add_path(fit, "--out", "FILE", "file for the gate, .json", required=True)
-    add_flags(fit, FIT_FLAGS, {"--gate-from": float})
-    fit.set_defaults(gate_from=ScheduleConfig.gate_from)
+    fit.add_argument(
+        "--gate-from",
+        type=float,
+        default=ScheduleConfig.gate_from,
+        metavar="IMAGES",
+        help="also evaluate separately the spawns (births during training) from this time on; take "
+        "schedule.gate_from times schedule.scale of the runs that will use the gate (default: %(default)s)",
+    )
     sample = add_command(actions, "sample", run_sample, "reduce the lineage of a run to one file")
     add_path(sample, "folder", "RUN", "folder of a run with lineage")
     add_path(sample, "--out", "FILE", "file for the sample, .parquet", required=True)
-    add_flags(
-        sample, "--rows N  approximate number of births in the file (default: %(default)s)", {"--rows": int}
-    )
-    sample.set_defaults(rows=spawn_samples.MAX_ROWS)
+    text = "approximate number of births in the file (default: %(default)s)"
+    sample.add_argument("--rows", type=int, default=spawn_samples.MAX_ROWS, metavar="N", help=text)
     judge = add_command(actions, "evaluate", run_evaluate, "measure a gate on the lineage of runs")
     _add_gate(judge)
     add_path(judge, "runs", "RUN", "folder of a run with lineage", nargs="+")
@@ -72,8 +70,8 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     _add_gate(again)
     add_path(again, "folder", "RUN", "folder of a run with lineage")
     add_path(again, "--out", "DIR", "folder for these runs and their figures", required=True)
-    add_flags(again, "--rate RATE  share of the candidates to withhold (default: 0.6)", {"--rate": float})
-    again.set_defaults(rate=0.6)
+    text = "share of the candidates to withhold (default: %(default)s)"
+    again.add_argument("--rate", type=float, default=0.6, metavar="RATE", help=text)
     add_capture(again)
     add_device(again, shares_gpus=True)
 
@@ -83,8 +81,8 @@ def _add_gate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("gate", type=gate_file, metavar="GATE", help=text)
 
 
-def run_fit(args: argparse.Namespace) -> int:
-    """Fit a gate; returns the exit status."""
+def run_fit(args: argparse.Namespace) -> None:
+    """Fit a gate."""
     if args.out.suffix != ".json":
         raise ValueError(f"--out {args.out}: a gate's file ends in .json")
     if not args.gate_from >= 0:
@@ -98,11 +96,10 @@ def run_fit(args: argparse.Namespace) -> int:
     print(f"{args.out}: fitted on {len(runs)} run{'s' * (len(runs) > 1)}; {figures['protocol']}:")
     for entry in figures["held_out"]:
         print(f"  {_judgement(entry)}")
-    return 0
 
 
-def run_sample(args: argparse.Namespace) -> int:
-    """Write a sample of spawns; returns the exit status."""
+def run_sample(args: argparse.Namespace) -> None:
+    """Write a sample of spawns."""
     if args.out.suffix != spawn_samples.SUFFIX:
         raise ValueError(f"--out {args.out}: a sample's file ends in {spawn_samples.SUFFIX}")
     if args.rows < 1:
@@ -111,18 +108,17 @@ def run_sample(args: argparse.Namespace) -> int:
     args.out.parent.mkdir(parents=True, exist_ok=True)
     rate = spawn_samples.write_sample(run, args.out, args.rows)
     print(f"{args.out}: {rate:.2%} of {len(run.survived):,} spawns of {run.name}")
-    return 0
 
 
-def run_evaluate(args: argparse.Namespace) -> int:
-    """Judge a gate; returns the exit status."""
+def run_evaluate(args: argparse.Namespace) -> None:
+    """Judge a gate."""
     gate = SpawnGate(args.gate)
     runs = [_spawns_of(folder) for folder in args.runs]
     output = OutputFolder(args.out)
     figures = args.out / "evaluation.json"
     output.check(figures)
     args.out.mkdir(parents=True, exist_ok=True)
-    schedules = [load_config(folder / run_files.CONFIG).schedule for folder in args.runs]
+    schedules = [open_run(folder).config().schedule for folder in args.runs]
     gate_from = [Schedule(schedule).pace.image(schedule.gate_from) for schedule in schedules]
     results = gate_fit.evaluate(gate, runs, gate_from, output)
     output.write(figures, (json.dumps(results, indent=1) + "\n").encode())
@@ -132,17 +128,14 @@ def run_evaluate(args: argparse.Namespace) -> int:
         regions = "" if r is None else f"; regions r {r:.2f}"
         print(_judgement(result) + regions + seen)
     print(f"{args.out}: {figures.name}, {gate_fit.SURVIVAL} and maps of regions")
-    return 0
 
 
-def run_replay(args: argparse.Namespace) -> int:
-    """Train the arms; returns the exit status."""
+def run_replay(args: argparse.Namespace) -> None:
+    """Train the arms."""
     if not 0 <= args.rate <= 1:
         raise ValueError(f"--rate: must be in [0, 1], got {args.rate}")
     gate = SpawnGate(args.gate)
-    if not (args.folder / run_files.CONFIG).exists():
-        raise ConfigError(f"{args.folder} is not a run: it has no {run_files.CONFIG}")
-    config = load_config(args.folder / run_files.CONFIG)
+    config = open_run(args.folder).config()
     if args.data is not None:
         config = changed(config, "data", path=str(args.data))
     results: list[dict[str, Any]] = []
@@ -161,7 +154,6 @@ def run_replay(args: argparse.Namespace) -> int:
                 (args.out / TABLE).write_text(_table(results))
         if ranks.rank == 0:
             print(_table(results))
-    return 0
 
 
 def _spawns_of(folder: Path) -> gate_fit.Spawns:

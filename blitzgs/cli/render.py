@@ -26,8 +26,8 @@ from blitzgs.cli import arguments
 from blitzgs.cli.arguments import chosen_views
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs import run_files
-from blitzgs.runs.cameras import CAMERAS, RunCameras, input_files, load_cameras
+from blitzgs.runs import run_files, trained_model
+from blitzgs.runs.cameras import RunCameras, input_files, load_cameras
 from blitzgs.runs.evaluation import render_view
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.inputs import check_capture, open_capture
@@ -95,8 +95,8 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
 _OTHER_FILMS = (".gif", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".webp")
 
 
-def run(args: argparse.Namespace) -> int:
-    """Render views; returns the exit status."""
+def run(args: argparse.Namespace) -> None:
+    """Render views."""
     film = _film(args)
     is_film = args.out.suffix.lower() == SUFFIX
     if film is not None and is_film:
@@ -110,7 +110,6 @@ def run(args: argparse.Namespace) -> int:
         if ranks.rank == 0:
             count, what = len(opened.indices), "frames" if is_film else "images"
             print(f"{args.out}: {count} {what}")
-    return 0
 
 
 def _film(args: argparse.Namespace) -> Film | None:
@@ -252,7 +251,7 @@ def open_rendered(args: argparse.Namespace, film: Film | None, ranks: Ranks) -> 
         stored, exposures = None, None
     else:
         folder, checkpoint = run_files.run_and_checkpoint(args.model)
-        model = run_files.open_model(folder, ranks, args.data, args.resident_gb, checkpoint)
+        model = trained_model.open_model(folder, ranks, args.data, args.resident_gb, checkpoint)
         exposures = model.exposures
         box = _shared_box(model.table, ranks)
         stored = _stored_cameras(args, folder, model, ranks)
@@ -301,13 +300,13 @@ def _exposures(found: Tensor | None, stored: RunCameras) -> dict[int, Tensor]:
 
 
 def _stored_cameras(
-    args: argparse.Namespace, folder: Path, model: run_files.TrainedModel, ranks: Ranks
+    args: argparse.Namespace, folder: Path, model: trained_model.TrainedModel, ranks: Ranks
 ) -> RunCameras | None:
     """Return the cameras of the given capture; without one, those that the run stored, else its capture's.
 
     Frames and cameras of a file need neither, so None is returned if the run has not stored its cameras.
     """
-    if args.data is None and (folder / CAMERAS).exists():
+    if args.data is None and (folder / run_files.CAMERAS).exists():
         return load_cameras(folder)
     if args.data is None and (args.path is not None or args.cameras is not None):
         return None

@@ -62,13 +62,12 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> int:
-    """Reconstruct; returns the exit status."""
+def run(args: argparse.Namespace) -> None:
+    """Reconstruct."""
     find_poses(
         photograph_folder(args.photos), args.capture, Settings(args.pairs, args.mapper, args.camera_model)
     )
     _print_next(args.capture)
-    return 0
 
 
 def find_poses(folder: Path, capture: Path, settings: Settings) -> None:
@@ -162,12 +161,11 @@ def add_refine(commands: Commands[argparse.ArgumentParser], summary: str) -> Non
     add_path(parser, "new", "NEW", "folder to write")
 
 
-def run_refine(args: argparse.Namespace) -> int:
-    """Refine; returns the exit status."""
+def run_refine(args: argparse.Namespace) -> None:
+    """Refine."""
     begin = time.monotonic()
     _print_found(refine(args.capture, args.new).lines(), begin)
     _print_next(args.new)
-    return 0
 
 
 def _print_found(lines: list[str], begin: float) -> None:

@@ -19,21 +19,23 @@ from rich.table import Table
 
 from blitzgs.capture.colmap import find_models
 from blitzgs.cli.arguments import Commands, add_command, add_device, add_flags, number
+from blitzgs.cli.report import write_final_report
 from blitzgs.cli.sfm import understood_alone, with_poses
-from blitzgs.cli.view import kept_warnings, write_final_report
 from blitzgs.config.fields import Config, Transport
 from blitzgs.config.files import ConfigError, changed, default_recipe, load_config, recipe_path, to_dict
 from blitzgs.config.ranges import describe, describe_all, describe_page
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import run_files
-from blitzgs.runs.folder_checks import locked
+from blitzgs.runs.folder_checks import check_unclaimed, locked
+from blitzgs.runs.resume import check_before_capture
 from blitzgs.sfm.refine import fit_of
+from blitzgs.spawn.gate import RANDOM, SpawnGate, gate_file
 from blitzgs.training.budget import LEAST_IMAGES, estimate
 from blitzgs.training.inputs import open_capture, read_ahead
-from blitzgs.training.setup import check_unclaimed
 from blitzgs.training.state import TrainingState
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.understood import check_worlds, understood
+from blitzgs.util.errors import kept_warnings
 from blitzgs.util.output import check_outside
 from blitzgs.util.progress import Laps
 from blitzgs.util.terminal import printable
@@ -144,18 +146,18 @@ class _Help(argparse.Action):
         parser.exit()
 
 
-def run(args: argparse.Namespace) -> int:
-    """Train; returns the exit status."""
+def run(args: argparse.Namespace) -> None:
+    """Train."""
     if args.extend is not None and args.minutes is not None:
         args.parser.error("--extend and --minutes exclude each other: --extend says how many images")
     args.resume = args.resume or args.extend is not None
-    if args.out is None and not args.show_config and not args.check:
+    if args.out is None and not args.show_config and (args.resume or not args.check):
         needed = "--out" if args.data or args.config else "--data, --out"
         args.parser.error(f"the following arguments are required: {needed}")
     config = _config(args)
     if args.show_config:
         print(json.dumps(to_dict(config), indent=1))
-        return 0
+        return
     if args.viewer is not None:
         from blitzgs.viewer.page import require_viser
 
@@ -165,12 +167,15 @@ def run(args: argparse.Namespace) -> int:
             f"{args.out} holds no run to continue (it has no config.yaml): check --out, or name the capture "
             "of a new run with --data"
         )
-    if args.check:
-        return _check(args, config)
     # Before the photographs, which take long.
-    check_unclaimed(args.out, args.resume)
+    if (gate := config.population.gate) is not None and gate != RANDOM:
+        SpawnGate(gate_file(gate))
     if config.model.start and not args.resume and not Path(config.model.start).exists():
         raise FileNotFoundError(f"{config.model.start}: there is no such file of Gaussians (--start)")
+    if args.check:
+        _check(args, config)
+        return
+    check_unclaimed(args.out, args.resume)
     if (photographs := Path(config.data.path) / config.data.images).is_dir():
         check_outside(args.out, photographs)
     job, laps = config.ranks, Laps(since_start=True)
@@ -180,6 +185,8 @@ def run(args: argparse.Namespace) -> int:
         if posed is not config:
             laps.lap("poses")
         config = posed
+    if args.resume:
+        check_before_capture(args.out, config, args.extend is not None)
     with (
         kept_warnings() as warned,
         nullcontext(read_ahead(config.data)) as reading,  # while the ranks join
@@ -211,13 +218,12 @@ def run(args: argparse.Namespace) -> int:
                 write_final_report(args.out, summary)
                 if summary is not None:
                     _print_summary(summary, args.out)
-    return 0
 
 
-def _check(args: argparse.Namespace, config: Config) -> int:
+def _check(args: argparse.Namespace, config: Config) -> None:
     if not args.no_sfm and (text := understood_alone(config)) is not None:
         print(text)
-        return 0
+        return
     capture, images = open_capture(config, Ranks())
     check_worlds(capture)
     lines = understood(config, capture, images)
@@ -228,7 +234,6 @@ def _check(args: argparse.Namespace, config: Config) -> int:
     rough = estimate(config, capture, _on_gpu(args), torch.get_num_threads())
     lines.append(f"{'training:':15}{rough}")
     print("\n".join(lines), flush=True)
-    return 0
 
 
 def _on_gpu(args: argparse.Namespace) -> bool:
@@ -246,10 +251,6 @@ def _config(args: argparse.Namespace) -> Config:
         source = recipe_path(recipe)
         if os.environ.get("RANK", "0") == "0":  # torchrun's number of the process
             print(f"recipe: {recipe} (choose another one with --config)", file=sys.stderr)
-    if not args.resume and source is not None and own is not None and own.exists() and own.samefile(source):
-        raise ConfigError(
-            f"{source} would be overwritten by the new run's resolved configuration: choose another --out"
-        )
     minutes = [] if args.minutes is None else [f"schedule.minutes={args.minutes}"]
     begun = args.resume and own is not None and any((args.out / run_files.CHECKPOINTS).glob("checkpoint_*"))
     if args.minutes and begun and own is not None and own.exists() and load_config(own).schedule.minutes == 0:

@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands `blitzgs view`, `report` and `compare`: look at a model, a run, or several runs."""
+"""The command `blitzgs view`: look at a model in the browser."""
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
-import sys
 import time
-import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -18,22 +15,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from blitzgs.cli.arguments import (
-    Commands,
-    add_capture,
-    add_command,
-    add_device,
-    add_flags,
-    add_model,
-    add_path,
-    add_run,
-)
+from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_flags, add_model
 from blitzgs.distributed.group import Ranks, extend_memory_in_place, resolve_device
 from blitzgs.formats.streamed_sog import META
 from blitzgs.formats.tiles import PAGE, TILESET
 from blitzgs.runs import run_files
 from blitzgs.training.inputs import open_capture
-from blitzgs.util.errors import warn
 from blitzgs.util.terminal import printable
 from blitzgs.viewer.door import is_loopback, unheard
 
@@ -68,10 +55,11 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     add_device(parser)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Show a model until Ctrl-C; returns the exit status."""
+def run(args: argparse.Namespace) -> None:
+    """Show a model until Ctrl-C."""
     if (args.model / TILESET).is_file():
-        return serve_tiles(args.model, args.host, args.port)
+        serve_tiles(args.model, args.host, args.port)
+        return
     if (args.model / META).is_file():
         raise ValueError(f"{args.model} is streamed SOG, which SuperSplat shows; blitzgs view needs --tiles")
     from blitzgs.viewer.page import require_viser
@@ -97,7 +85,6 @@ def run(args: argparse.Namespace) -> int:
         print()
     finally:
         studio.close()
-    return 0
 
 
 def photographs(folder: Path, data: Path | None) -> Callable[[int], npt.NDArray[np.uint8]] | None:
@@ -149,8 +136,8 @@ def tiles_server(folder: Path, host: str, port: int) -> ThreadingHTTPServer:
         raise unheard(host, port, error) from error
 
 
-def serve_tiles(folder: Path, host: str, port: int) -> int:
-    """Serve until Ctrl-C; returns the exit status."""
+def serve_tiles(folder: Path, host: str, port: int) -> None:
+    """Serve until Ctrl-C."""
     with tiles_server(folder, host, port) as server:
         shown = "localhost" if is_loopback(host) else host
         print(f"{folder}: open http://{shown}:{server.server_port}/ (Ctrl-C ends)", flush=True)
@@ -158,89 +145,3 @@ def serve_tiles(folder: Path, host: str, port: int) -> int:
             server.serve_forever()
         except KeyboardInterrupt:
             print()
-    return 0
-
-
-REPORT_HELP = """\
-Write the report of a run as one HTML file that needs no network: metrics of each held-out view, best and
-worst views beside their photographs, curves, the model in 3D, stages of time, a plan of the cameras,
-exposures, warnings, and the configuration. blitzgs train writes it at its end; this command writes it again,
-for example after blitzgs eval.
-"""
-
-
-def add_report(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
-    """Add the command."""
-    parser = add_command(commands, "report", run_report, summary, REPORT_HELP)
-    add_run(parser)
-    add_flags(parser, "--out FILE  the file (default: RUN/report.html)")
-
-
-def run_report(args: argparse.Namespace) -> int:
-    """Write the report; returns the exit status."""
-    from blitzgs.report.report import look_of, write_report
-
-    look = None
-    try:
-        look = look_of(args.folder)
-    except (OSError, ValueError, RuntimeError) as error:
-        run_files.check_is_run(args.folder)
-        print(printable(f"the report goes without the model in 3D: {error}"), file=sys.stderr)
-    print(printable(str(write_report(args.folder, look, args.out))))
-    return 0
-
-
-# The model in 3D is read from the checkpoint, beside the model in memory: only up to so many Gaussians.
-_MAX_GAUSSIANS = 2_000_000
-
-
-@contextlib.contextmanager
-def kept_warnings() -> Iterator[list[str]]:
-    """Yield a list that gets the texts of all warnings inside the context, which are shown as usual."""
-    texts: list[str] = []
-    usual = warnings.showwarning
-
-    def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
-        if issubclass(category, UserWarning):
-            texts.append(str(message))
-        usual(message, category, *place, **more)
-
-    warnings.showwarning = show
-    try:
-        yield texts
-    finally:
-        warnings.showwarning = usual
-
-
-def write_final_report(folder: Path, summary: Mapping[str, object] | None) -> None:
-    """Write the report of a run that ends; a failure is a warning."""
-    from blitzgs.report.report import look_of, write_report
-
-    count = 0 if summary is None else summary["gaussians"]
-    try:
-        look = look_of(folder) if isinstance(count, int) and 0 < count <= _MAX_GAUSSIANS else None
-        write_report(folder, look)
-    except Exception as error:
-        warn(f"the report was not written ({type(error).__name__}: {error}); blitzgs report RUN tries again")
-
-
-COMPARE_HELP = """\
-Put runs side by side in one HTML file that needs no network: their figures, differences of configuration,
-metrics of each view, curves, and pictures of the same views. The others are compared with the first run.
-"""
-
-
-def add_compare(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
-    """Add the command."""
-    parser = add_command(commands, "compare", run_compare, summary, COMPARE_HELP)
-    add_path(parser, "folders", "RUN", "folders of two runs or more", nargs="+")
-    add_path(parser, "--out", "FILE", "the file (default: %(default)s)", default=Path("compare.html"))
-
-
-def run_compare(args: argparse.Namespace) -> int:
-    """Write the page; returns the exit status."""
-    from blitzgs.report.report import compare, write_page
-
-    write_page(args.out, compare(args.folders))
-    print(printable(str(args.out)))
-    return 0

@@ -19,6 +19,7 @@ from torch import Tensor
 from blitzgs.config.fields import Transport
 from blitzgs.distributed.shared_memory import LEAST_WORDS, SharedMemory, control_words, symmetric_words
 from blitzgs.distributed.watchdog import BUSY_SECONDS, NoWatchdog, Watchdog, open_store
+from blitzgs.util.errors import UserError
 
 T = TypeVar("T")
 ReduceOp = Literal["sum", "min", "max"]
@@ -33,7 +34,7 @@ STARTUP_TIMEOUT_SECONDS = 300.0
 MAX_PEERS = 16
 
 
-class MismatchError(RuntimeError):
+class MismatchError(UserError):
     """The ranks were started with different configurations, code or data."""
 
 

@@ -17,11 +17,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from blitzgs.capture.cameras import camera_centres
-from blitzgs.capture.world import GEO, GEOCENTRIC, WorldFrame, read_world_frame
+from blitzgs.capture.world import GEOCENTRIC, WorldFrame
 from blitzgs.runs import run_files
-from blitzgs.runs.cameras import CAMERAS, EXPOSURES, RunCameras, load_cameras
+from blitzgs.runs.cameras import RunCameras, load_cameras
+from blitzgs.runs.checkpoint_files import DAMAGE
 from blitzgs.runs.evaluation import FOLDER, INDEX, METRICS, PARTS, preview_file
 from blitzgs.runs.folder import RunFolder, open_run
+from blitzgs.runs.world import load_world_frame
 from blitzgs.viewer.world import horizontal, up_direction
 
 T = TypeVar("T")
@@ -69,14 +71,13 @@ def read_run(path: Path) -> RunData:
         data.summary = _mapping(folder.summary())
     except ValueError as error:
         data.problems.append(f"{error}.")
-    records = [record for record in folder.log() if isinstance(record, dict) and _is_number(record.get("t"))]
+    records = [record for record in folder.log() if _is_number(record.get("t"))]
     identity = _start_of(records).get("run")
     data.log = [record for record in records if record.get("run") == identity]
     try:
-        if (path / CAMERAS).exists():
+        if (path / run_files.CAMERAS).exists():
             data.cameras = load_cameras(path)
-        if (path / GEO).exists():
-            data.frame = read_world_frame(path / GEO)
+        data.frame = load_world_frame(path)
     except ValueError as error:
         data.problems.append(f"{error}.")
     evaluations = path / run_files.EVALUATION
@@ -212,7 +213,7 @@ def exposures(data: RunData) -> list[list[Any]]:
             raise ValueError("an exposure has another number of values")
         return [rows[index] for index in evenly(list(range(len(rows))), MAX_LISTED)]
 
-    return _parsed(data.folder.path / EXPOSURES, data.problems, listed, [])
+    return _parsed(data.folder.path / run_files.EXPOSURES, data.problems, listed, [])
 
 
 def pictured(data: RunData) -> dict[str, int]:
@@ -289,7 +290,7 @@ def _parsed(path: Path, problems: list[str], convert: Callable[[Any], T], missin
         return convert(json.loads(path.read_text(encoding="utf-8")))
     except FileNotFoundError:
         return missing
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+    except DAMAGE as error:
         problems.append(f"{path} is damaged ({error}).")
         return missing
 

@@ -19,11 +19,11 @@ from torch import Tensor
 from blitzgs.capture.cameras import MAX_SIDE, Float64
 from blitzgs.capture.capture import Capture
 from blitzgs.runs.checkpoint_files import DAMAGE
+from blitzgs.runs.run_files import CAMERAS
 from blitzgs.util.errors import warn
 from blitzgs.util.output import write_file
 from blitzgs.view.views import CameraLike
 
-CAMERAS = "cameras.json"
 _VERSION = 1
 # Bytes that are read at the beginning, middle and end of a photograph to recognise it; names in a warning.
 _PIECE, _NAMED, _THREADS = 4096, 4, 16
@@ -157,7 +157,7 @@ def warn_of_changes(folder: Path, capture: Capture) -> None:
     try:
         views = json.loads((folder / CAMERAS).read_text(encoding="utf-8"))["cameras"]
         before = {view["name"]: view.get("stamp", "") for view in views}
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+    except DAMAGE:
         return  # an older run, or a damaged file, which is named where it is needed
     now = _stamps(capture)
     changed = [name for name, stamp in before.items() if stamp and now.get(name, "") not in ("", stamp)]
@@ -244,8 +244,6 @@ def _indices(values: Sequence[int], count: int) -> list[int]:
 
 # Photographs whose gains differ by less than this, as a standard deviation, have the same exposure.
 LEAST_SPREAD = 0.02
-# File in the folder of a finished run: gain and bias, [2, 3], by the name of the photograph.
-EXPOSURES = "exposures.json"
 # Name of the tensor among those of a checkpoint that are the same on all ranks.
 SHARED_EXPOSURES = "exposures"
 

@@ -9,6 +9,7 @@ compares the files with the digests. The folder must be on a file system that ev
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import shutil
@@ -25,17 +26,17 @@ from torch import Tensor
 from blitzgs.distributed.group import Ranks
 from blitzgs.population.redistribution import global_positions
 from blitzgs.runs.checkpoint_files import DAMAGE, Manifest, Shard, finish, opened, verified, write_shard
-from blitzgs.util.errors import warn
-from blitzgs.util.output import check_space, explain, is_lack_of_space
+from blitzgs.util.errors import UserError, warn
 
 T = TypeVar("T")
 
 SHARED = "shared.safetensors"
 _NAME = re.compile(r"checkpoint_(\d{6,})")
 _UNFINISHED = ".unfinished_"
+_LACK_OF_SPACE = (errno.ENOSPC, errno.EDQUOT)
 
 
-class CheckpointError(RuntimeError):
+class CheckpointError(UserError):
     """A checkpoint could not be written or read; the message names the checkpoint and the reason."""
 
     def __init__(self, message: str, lacks_space: bool = False) -> None:
@@ -108,26 +109,17 @@ class Saving:
         shared: Mapping[str, Tensor],
         device: torch.device,
         ready: torch.cuda.Event | None,
-    ) -> tuple[Shard | None, Shard | None, str | None, bool]:
-        """Write this rank's files; return what they are, or why there are none and whether space lacks."""
-        ranks = self._ranks
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            check_space(self._folder, columns)
-            file = f"shard_{ranks.rank:04d}_of_{ranks.world_size:04d}.safetensors"
-            # On a stream of its own, copies to the host wait for no later work.
-            with torch.cuda.stream(None if ready is None else torch.cuda.Stream(device)):
-                if ready is not None:
-                    ready.wait()
-                mine = Shard(file, self._rows, *write_shard(self._folder / file, columns))
-                common = None
-                if shared:
-                    written = write_shard(self._folder / SHARED, shared)
-                    common = Shard(SHARED, 0, *written)
-            return mine, common, None, True
-        except OSError as error:
-            text = f"rank {ranks.rank} could not write: {explain(error)}"
-            return None, None, text, is_lack_of_space(error)
+    ) -> tuple[Shard, Shard | None]:
+        """Write this rank's files, and return them."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        file = f"shard_{self._ranks.rank:04d}_of_{self._ranks.world_size:04d}.safetensors"
+        # On a stream of its own, copies to the host wait for no later work.
+        with torch.cuda.stream(None if ready is None else torch.cuda.Stream(device)):
+            if ready is not None:
+                ready.wait()
+            mine = Shard(file, self._rows, *write_shard(self._folder / file, columns))
+            common = Shard(SHARED, 0, *write_shard(self._folder / SHARED, shared)) if shared else None
+        return mine, common
 
     def finish(self) -> Path:
         """Wait until all ranks have written, and give the checkpoint its name. Collective.
@@ -137,8 +129,14 @@ class Saving:
         unchanged. ValueError: a column has a dtype that the format lacks.
         """
         ranks, path = self._ranks, self._directory / self._name
-        with ranks.watchdog.working("writing a checkpoint"):
-            mine, common, problem, lacks_space = self._written.result()
+        mine = common = problem = None
+        lacks_space = True
+        try:
+            with ranks.watchdog.working("writing a checkpoint"):
+                mine, common = self._written.result()
+        except OSError as error:
+            problem = f"rank {ranks.rank} could not write: {_explain(error)}"
+            lacks_space = error.errno in _LACK_OF_SPACE
         results = ranks.all_gather_object((mine, problem, lacks_space))
         problems = [text for _, text, _ in results if text]
         lacks_space = all(lacks for _, _, lacks in results)
@@ -146,10 +144,10 @@ class Saving:
             try:
                 with ranks.watchdog.working("finishing a checkpoint"):
                     shards = [shard for shard, _, _ in results if shard]
-                    finish(self._folder, path, shards, common, self._state, ranks.world_size)
+                    finish(self._folder, path, Manifest(shards, common, self._state))
             except OSError as error:
-                problems.append(f"rank 0 could not write: {explain(error)}")
-                lacks_space = is_lack_of_space(error)
+                problems.append(f"rank 0 could not write: {_explain(error)}")
+                lacks_space = error.errno in _LACK_OF_SPACE
         problems, lacks_space = ranks.broadcast_object((problems, lacks_space))
         if problems:
             if ranks.rank == 0:
@@ -172,7 +170,7 @@ class Loaded:
     """A checkpoint in memory."""
 
     columns: dict[str, Tensor]  # columns of this rank's shard, [N_rank, ...], on the device
-    state: dict[str, Any]  # the state that was saved with them
+    state: Mapping[str, Any]  # the state that was saved with them
     shared: dict[str, Tensor]  # tensors that are the same on all ranks, on the CPU; empty if none were stored
 
 
@@ -220,29 +218,21 @@ def sound_manifest(path: Path, ranks: Ranks) -> Manifest:
     return manifest
 
 
-def load(
-    path: Path,
-    ranks: Ranks,
-    device: torch.device | str,
-    problem: Callable[[dict[str, Tensor]], str | None] = lambda columns: None,
-) -> Loaded:
+def load(path: Path, ranks: Ranks, device: torch.device | str) -> Loaded:
     """Load this rank's share of one checkpoint. Collective.
 
     With the world size that it was saved with, each rank gets its own shard unchanged. With another one the
     rows are redistributed: rank m gets the positions = m (mod M) of the global order
-    (`sharding.global_positions`), and opens only the files that hold some of these rows.
+    (`redistribution.global_positions`), and opens only the files that hold some of these rows.
 
-    `path`: folder returned by `Saving.finish`. `problem`: returns what is wrong with a shard's columns, or
-    None. CheckpointError: on every rank, when a file is missing, torn or altered, or a shard has a problem.
+    `path`: folder returned by `Saving.finish`. CheckpointError: on every rank, when a file is missing, torn
+    or altered.
     """
     manifest, shared = sound_manifest(path, ranks), {}
     if manifest.shared is not None:
         with opened(path / manifest.shared.file) as file:
             shared = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    columns = read_share(path, manifest.shards, ranks, torch.device(device))
-    if wrong := [text for text in ranks.all_gather_object(problem(columns)) if text]:
-        raise CheckpointError(f"checkpoint {path} is refused: {'; '.join(wrong)}")
-    return Loaded(columns, manifest.state, shared)
+    return Loaded(read_share(path, manifest.shards, ranks, torch.device(device)), manifest.state, shared)
 
 
 def read_share(path: Path, shards: list[Shard], ranks: Ranks, device: torch.device) -> dict[str, Tensor]:
@@ -266,6 +256,15 @@ def read_share(path: Path, shards: list[Shard], ranks: Ranks, device: torch.devi
                 column = columns.setdefault(name, part.new_empty((count, *part.shape[1:])))
                 column[target.to(device)] = part
     return columns
+
+
+def _explain(error: OSError) -> str:
+    """Return why a file was not written, and what to do where that is known."""
+    if error.errno in _LACK_OF_SPACE:
+        return f"the disk is full ({error}); free some space or lower the number of checkpoints kept"
+    if error.errno == errno.EFBIG:
+        return f"a file is larger than is allowed ({error}); raise the limit (ulimit -f) or use another disk"
+    return str(error)
 
 
 def _delete_old(directory: Path, keep: int) -> Thread:

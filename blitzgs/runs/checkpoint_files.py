@@ -8,9 +8,11 @@ be expensive.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -23,6 +25,7 @@ from safetensors import safe_open
 from torch import Tensor
 
 from blitzgs.util.output import sync_to_disk
+from blitzgs.util.terminal import amount
 
 FORMAT = 2
 MANIFEST = "manifest.json"
@@ -46,18 +49,19 @@ class Manifest:
 
     shards: list[Shard]
     shared: Shard | None
-    state: dict[str, Any]
+    state: Mapping[str, Any]
 
 
 def verified(path: Path, part: int = 0, parts: int = 1) -> Manifest:
     """Read the manifest of a checkpoint, and compare part of the files with their digests; see `DAMAGE`."""
-    manifest = _read_manifest(path)
+    manifest = read_manifest(path)
     for shard in [*manifest.shards, *([manifest.shared] if manifest.shared else [])][part::parts]:
         _verify(path, shard)
     return manifest
 
 
-def _read_manifest(path: Path) -> Manifest:
+def read_manifest(path: Path) -> Manifest:
+    """Read the manifest of a checkpoint, whose files may be damaged; see `DAMAGE`."""
     try:
         content = json.loads((path / MANIFEST).read_text())
     except FileNotFoundError:
@@ -90,25 +94,12 @@ def _verify(path: Path, shard: Shard) -> None:
         raise ValueError(f"{shard.file} does not match its SHA-256")
 
 
-def finish(
-    unfinished: Path,
-    path: Path,
-    shards: list[Shard],
-    shared: Shard | None,
-    state: Mapping[str, Any],
-    world_size: int,
-) -> None:
+def finish(unfinished: Path, path: Path, manifest: Manifest) -> None:
     """Write the manifest beside the shards and give the folder its final name, each step synced."""
-    missing = [shard.file for shard in shards if not (unfinished / shard.file).exists()]
+    missing = [shard.file for shard in manifest.shards if not (unfinished / shard.file).exists()]
     if missing:
         raise OSError(f"{', '.join(missing)} not in {unfinished}: every rank must see the same file system")
-    content = {
-        "format": FORMAT,
-        "world_size": world_size,
-        "shards": [asdict(shard) for shard in shards],
-        "shared": None if shared is None else asdict(shared),
-        "state": dict(state),
-    }
+    content = {"format": FORMAT, "world_size": len(manifest.shards)} | asdict(manifest)
     content = json.loads(json.dumps(content))  # tuples become lists: what is read back has the same digest
     with open(unfinished / MANIFEST, "w") as file:
         json.dump(content | {"sha256": _digest(content)}, file, indent=1)
@@ -137,7 +128,7 @@ _CHUNK_BYTES = 64 << 20
 def write_shard(path: Path, columns: Mapping[str, Tensor]) -> tuple[int, str]:
     """Write and sync columns, on any device; return the size in bytes and the SHA-256 in hexadecimal.
 
-    ValueError: a column has a dtype that the format lacks.
+    ValueError: a column has a dtype that the format lacks. OSError: also if the free space is too small.
     """
     # Widest elements first, so that every column starts at a multiple of its element size.
     names = sorted(columns, key=lambda name: (-columns[name].element_size(), name))
@@ -153,6 +144,10 @@ def write_shard(path: Path, columns: Mapping[str, Tensor]) -> tuple[int, str]:
             "data_offsets": [offset, end],
         }
         offset = end
+    free = shutil.disk_usage(path.parent).free
+    if free < offset:
+        text = f"{amount(offset)} are needed and {amount(free)} are free"
+        raise OSError(errno.ENOSPC, text, str(path.parent))
     head = json.dumps(header).encode()
     head += b" " * (-len(head) % 8)
     digest = hashlib.sha256()

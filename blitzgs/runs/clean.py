@@ -7,7 +7,6 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +26,6 @@ from blitzgs.runs.cameras import RunCamera, RunCameras
 from blitzgs.runs.evaluation import image_metrics
 from blitzgs.runs.folder import Model, subject_of
 from blitzgs.table.table import PARAMETERS
-from blitzgs.util.output import write_file
 from blitzgs.view.views import CameraLike, viewmat
 from blitzgs.view.visible import Subject
 
@@ -59,11 +57,6 @@ class Cleaned:
     picture: bytes | None  # of what goes, as JPEG; None: nothing goes
     # Mean PSNR of the held-out views before and after; None: there are no photographs.
     psnr: tuple[float, float] | None
-
-    def write_picture(self, path: Path) -> None:
-        """Write the picture, if there is one."""
-        if self.picture is not None:
-            write_file(path, self.picture)
 
 
 def cleaned(

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -165,8 +166,20 @@ def evaluate(
         EvaluationStoppedError: `stops` returned True.
     """
     ranks = owners.ranks
-    files = None if folder is None else _Files(folder, inputs, optional_files)
-    chosen = files.plan(indices, cameras, pictures) if files is not None else {}
+    output = None if folder is None else OutputFolder(folder, inputs)
+    chosen: dict[int, Path] = {}  # evenly spaced views, and the paths of their pictures
+    if output is not None:
+        count = min(pictures, len(indices))
+        spaced = [indices[k * len(indices) // count] for k in range(count)]
+        with _tolerated(optional_files):
+            paths = output.paths([cameras[index].name for index in spaced], ".jpg", flat=True)
+            chosen = dict(zip(spaced, paths, strict=True))
+
+    def write(path: Path, content: bytes) -> None:
+        with _tolerated(optional_files):
+            if output is not None:
+                output.write(path, content)
+
     per_view: dict[str, dict[str, float]] = {}
     lost: str | None = None
     previews = Previews(folder, set(chosen)) if folder is not None and pictures > 0 else None
@@ -192,21 +205,31 @@ def evaluate(
             if mask is not None and not bool(mask.any()):
                 continue  # nothing to compare
             per_view[cameras[index].name] = image_metrics(render, target, mask, lpips)
-            if files is not None and index in chosen:
-                picture = comparison(render, target, mask)
-                files.write(chosen[index], encode_image(picture, ".jpg"))
+            if index in chosen:
+                write(chosen[index], encode_image(comparison(render, target, mask), ".jpg"))
             if previews is not None:
                 previews.add(index, per_view[cameras[index].name]["psnr"], render, target, mask)
     result = _over_all_ranks(per_view, lost, [cameras[index].name for index in indices], ranks)
-    if files is not None and ranks.rank == 0:
-        files.write(files.output.root / "metrics.json", json.dumps(result, indent=1).encode())
-    if files is not None and previews is not None:
+    if folder is not None and ranks.rank == 0:
+        write(folder / "metrics.json", json.dumps(result, indent=1).encode())
+    if previews is not None:
         psnr = {
             i: result["views"][cameras[i].name]["psnr"] for i in indices if cameras[i].name in result["views"]
         }
         for path, content in previews.files(psnr, ranks.rank == 0):
-            files.write(path, content)
+            write(path, content)
     return result
+
+
+@contextmanager
+def _tolerated(optional: bool) -> Iterator[None]:
+    """Make a warning of an error of writing inside the context, if the file is optional."""
+    try:
+        yield
+    except OSError as error:
+        if not optional:
+            raise
+        warn(f"the evaluation could not write a file and goes on without it: {error}")
 
 
 def _over_all_ranks(
@@ -245,34 +268,6 @@ def evenly_ordered(indices: Sequence[int]) -> list[int]:
     """Order indices such that the first few of them are spread evenly, however many are taken."""
     share = (math.sqrt(5) - 1) / 2
     return [index for _, index in sorted((k * share % 1, index) for k, index in enumerate(indices))]
-
-
-class _Files:
-    def __init__(self, folder: Path, inputs: Iterable[Path], optional: bool) -> None:
-        self.output = OutputFolder(folder, inputs)
-        self._optional = optional
-
-    def plan(self, indices: Sequence[int], cameras: Sequence[CameraLike], pictures: int) -> dict[int, Path]:
-        """Choose evenly spaced views; return their cameras and the paths of their pictures."""
-        count = min(pictures, len(indices))
-        chosen = [indices[k * len(indices) // count] for k in range(count)]
-        try:
-            paths = self.output.paths([cameras[index].name for index in chosen], ".jpg", flat=True)
-        except OSError as error:
-            self._failed(error)
-            return {}
-        return dict(zip(chosen, paths, strict=True))
-
-    def write(self, path: Path, content: bytes) -> None:
-        try:
-            self.output.write(path, content)
-        except OSError as error:
-            self._failed(error)
-
-    def _failed(self, error: OSError) -> None:
-        if not self._optional:
-            raise error
-        warn(f"the evaluation could not write a file and goes on without it: {error}")
 
 
 FOLDER, INDEX = "previews", "views.json"

@@ -1,41 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes a trained model as a file, block by block, in the capture's unit around its own origin."""
+"""Writes a model as a file, in the capture's coordinates or around an origin that float32 does not round."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from blitzgs.config.fields import Config
 from blitzgs.config.files import changed
-from blitzgs.config.schedule import Schedule
-from blitzgs.distributed.group import Ranks
-from blitzgs.formats import gaussians
-from blitzgs.formats.gaussians import MIP, Gaussians, GaussianSource, joined
+from blitzgs.formats.gaussians import Gaussians, GaussianSource
 from blitzgs.formats.models import Format, check_replaces, offset_of
-from blitzgs.formats.selection import Selected, Selection
-from blitzgs.optim.table_adam import TableAdam
-from blitzgs.runs import checkpoint, run_files
-from blitzgs.runs.cameras import SHARED_EXPOSURES
-from blitzgs.runs.checkpoint_files import Shard, opened
-from blitzgs.runs.folder import Model, model_of
-from blitzgs.runs.folder_checks import check_own
-from blitzgs.runs.run_files import Progress, TrainedModel, lod_gate
-from blitzgs.runs.world import trained_table
-from blitzgs.table.table import PARAMETERS, GaussianTable
+from blitzgs.runs.folder import Model
+from blitzgs.runs.source import Changed
 from blitzgs.util.output import write_file
-from blitzgs.util.progress import Report
-from blitzgs.view.gate import LodGate
 from blitzgs.view.views import CameraLike, Space
 
 COORDINATES = ("auto", "capture", "centred")
@@ -50,7 +34,7 @@ class Exported:
     # Add this to x, y, z to get coordinates of the capture's world; None: they are already.
     offset: tuple[float, float, float] | None
     sidecar: Path | None  # file that has the offset
-    rounding: float  # largest rounding error of a coordinate in float32, in the capture's unit
+    rounding: float  # without an offset, largest rounding error of a coordinate, in the capture's unit
 
 
 def export(
@@ -83,14 +67,14 @@ def export(
         raise ValueError(f"coordinates must be one of {', '.join(COORDINATES)}, got {coordinates!r}")
     check_replaces(path, kind)
     offset = np.array(space.offset)
-    reach, middle = _measured(source, offset)
-    rounding = _spacing(reach[1])
+    farthest, middle = _measured(source, offset)
+    rounding = float(np.spacing(np.float32(farthest))) / 2
     centred = coordinates == "centred" or (coordinates == "auto" and rounding > _MAX_ROUNDING * middle)
     if coordinates == "auto" and kind.quantised:
         centred |= float(np.linalg.norm(offset)) > 2 * space.extent * space.unit
-    _write_moved(source, space.offset, centred, kind.write, path, crs)
     if centred:
-        return Exported(space.offset, _sidecar(path), _spacing(reach[0]))
+        return Exported(space.offset, _write(source, np.zeros(3), space.offset, kind.write, path, crs), 0.0)
+    _write(source, offset, None, kind.write, path)
     return Exported(None, None, rounding)
 
 
@@ -107,32 +91,8 @@ def export_folder(
     makes the folder. FileExistsError, OSError: as `export`.
     """
     centred = float(np.linalg.norm(offset)) > 2 * extent
-    _write_moved(source, offset, centred, write, path)
-    return _sidecar(path) if centred else None
-
-
-def _write_moved(
-    source: GaussianSource,
-    offset: tuple[float, float, float],
-    centred: bool,
-    write: Callable[[Path, GaussianSource], object],
-    path: Path,
-    crs: str | None = None,
-) -> None:
-    """Write a model around an offset, stated beside it, or in the coordinates that include the offset."""
-    if centred:
-        return _write_centred(source, offset, write, path, crs)
-    write(path, _shifted(source, np.array(offset), source.comments))
-    # The offset of an earlier export to this name would move the model once more.
-    if _has_offset(_sidecar(path)):
-        _sidecar(path).unlink()
-
-
-def _shifted(source: GaussianSource, shift: npt.NDArray[np.float64], comments: list[str]) -> GaussianSource:
-    step = torch.from_numpy(shift)
-    return Changed(
-        source, lambda block: replace(block, means=(block.means.double() + step).float()), comments
-    )
+    shift = np.zeros(3) if centred else np.array(offset)
+    return _write(source, shift, offset if centred else None, write, path)
 
 
 def export_file(source: GaussianSource, kind: Format, path: Path) -> Exported:
@@ -147,56 +107,55 @@ def export_file(source: GaussianSource, kind: Format, path: Path) -> Exported:
         low, high = (some.sort(dim=0).values[int(share * (len(some) - 1))].numpy() for share in (0.01, 0.99))
         if np.linalg.norm(low + high) > 2 * np.linalg.norm(high - low) + 200:
             shift = np.round((low + high) / 2)
-    if not (offset.any() or shift.any()):
-        kind.write(path, source)
-        if _has_offset(_sidecar(path)):
-            _sidecar(path).unlink()
-        return Exported(None, None, 0.0)
-    lines = [line for line in source.comments if offset_of([line]) == (0, 0, 0)]
     x, y, z = (offset + shift).tolist()
-    _write_centred(_shifted(source, -shift, lines), (x, y, z), kind.write, path)
-    return Exported((x, y, z), _sidecar(path), 0.0)
+    stated = (x, y, z) if offset.any() or shift.any() else None
+    return Exported(stated, _write(source, -shift, stated, kind.write, path), 0.0)
 
 
-def _write_centred(
+def _write(
     source: GaussianSource,
-    offset: tuple[float, float, float],
+    shift: npt.NDArray[np.float64],
+    offset: tuple[float, float, float] | None,
     write: Callable[[Path, GaussianSource], object],
     path: Path,
     crs: str | None = None,
-) -> None:
-    """Write a model around an offset, which goes into the header and a file beside."""
-    sidecar = _sidecar(path)
-    if os.path.lexists(sidecar) and not _has_offset(sidecar):
-        raise FileExistsError(
-            f"{sidecar} exists and is not the offset of an exported model: choose another name"
-        )
-    x, y, z = offset
-    lines = [*source.comments, f"comment offset {x!r} {y!r} {z!r}"]
-    write(path, Changed(source, lambda block: block, lines))
+) -> Path | None:
+    """Write Gaussians moved by `shift`; if they are around an offset, return the file beside that states it.
+
+    The header states it, too.
+    """
+    sidecar = path.with_name(path.name + ".offset.json")
+    lines = [line for line in source.comments if offset_of([line]) == (0, 0, 0)]
+    if offset is not None:
+        if os.path.lexists(sidecar) and not _has_offset(sidecar):
+            raise FileExistsError(
+                f"{sidecar} exists and is not the offset of an exported model: choose another name"
+            )
+        lines.append("comment offset {!r} {!r} {!r}".format(*offset))
+    step = torch.from_numpy(shift)
+
+    def moved(block: Gaussians) -> Gaussians:
+        return replace(block, means=(block.means.double() + step).float()) if shift.any() else block
+
+    write(path, Changed(source, moved, lines))
+    if offset is None:
+        # The offset of an earlier export to this name would move the model once more.
+        if _has_offset(sidecar):
+            sidecar.unlink()
+        return None
     meaning = f"{'capture' if crs is None else 'world'} coordinates = coordinates in the file + offset"
     content = {"file": path.name, "offset": offset, "meaning": meaning}
     write_file(sidecar, json.dumps(content | ({"crs": crs} if crs else {}), indent=1))
+    return sidecar
 
 
-def _sidecar(path: Path) -> Path:
-    return path.with_name(path.name + ".offset.json")
-
-
-def _measured(source: GaussianSource, offset: npt.NDArray[np.float64]) -> tuple[tuple[float, float], float]:
-    """Return the largest coordinates without and with the offset, and the median Gaussian's middle axis."""
-    near, far, middles = 0.0, 0.0, []
+def _measured(source: GaussianSource, offset: npt.NDArray[np.float64]) -> tuple[float, float]:
+    """Return the largest coordinate, with the offset, and the median Gaussian's middle axis."""
+    farthest, middles = 0.0, []
     for block in source.blocks():
-        means = block.means.double().numpy()
-        near = max(near, float(np.abs(means).max()))
-        far = max(far, float(np.abs(means + offset).max()))
+        farthest = max(farthest, float(np.abs(block.means.double().numpy() + offset).max()))
         middles.append(block.scales.median(dim=1).values)
-    return (near, far), torch.cat(middles).median().exp().item() if middles else math.inf
-
-
-def _spacing(largest: float) -> float:
-    """Return half the distance between neighbouring float32 numbers at a coordinate."""
-    return float(np.spacing(np.float32(largest))) / 2
+    return farthest, torch.cat(middles).median().exp().item() if middles else math.inf
 
 
 def _has_offset(sidecar: Path) -> bool:
@@ -233,154 +192,3 @@ def without_antialiasing(model: Model, cameras: Sequence[CameraLike]) -> Model:
     baked = (opacities.double() * factor).clamp(1e-6, 1 - 1e-6)
     config = changed(model.config, "model", antialiased=False)
     return replace(model, opacities=baked.logit().float(), config=config)
-
-
-class Changed:
-    """A `GaussianSource` whose blocks are changed one by one, with header lines of its own."""
-
-    def __init__(
-        self, source: GaussianSource, change: Callable[[Gaussians], Gaussians], comments: list[str]
-    ) -> None:
-        self._source, self._change, self.comments = source, change, comments
-        self.degree, self.has_levels = source.degree, source.has_levels
-
-    def __len__(self) -> int:
-        return len(self._source)
-
-    def blocks(self) -> Iterator[Gaussians]:
-        """Yield all Gaussians, changed."""
-        for block in self._source.blocks():
-            yield dataclasses.replace(self._change(block), comments=self.comments)
-
-
-class Watched(Changed):
-    """A source that reports how many Gaussians of how many a reader has taken, anew for each reading."""
-
-    def __init__(self, source: GaussianSource, report: Report) -> None:
-        super().__init__(source, lambda block: block, source.comments)
-        self._report = report
-
-    def blocks(self) -> Iterator[Gaussians]:
-        """Yield all Gaussians."""
-        done = 0
-        for block in super().blocks():
-            yield block
-            done += len(block)
-            self._report(done, len(self))
-
-
-class RunSource(Changed):
-    """The Gaussians of a run; the unit is a power of two, so that positions keep their bits."""
-
-    def __init__(
-        self,
-        trained: GaussianSource,
-        space: Space,
-        comments: list[str],
-        config: Config,
-        progress: Progress | None = None,
-    ) -> None:
-        self.space, self.config, self.progress = space, config, progress
-        super().__init__(trained, self._scaled, comments)
-
-    def _scaled(self, block: Gaussians) -> Gaussians:
-        unit = self.space.unit
-        return dataclasses.replace(block, means=block.means * unit, scales=block.scales + math.log(unit))
-
-
-def source_of(model: Model) -> RunSource:
-    """Return the source of a model in memory."""
-    columns: dict[str, Any] = {name: getattr(model, name).cpu() for name in PARAMETERS}
-    found = Gaussians(**columns, levels=None if model.lod is None else model.level.cpu().float())
-    gate = None if model.lod is None else model.lod.gate
-    lines = _comments(model.config, model.space, gate, model.exposures is not None)
-    return RunSource(found, model.space, lines, model.config)
-
-
-def largest_of_run(source: RunSource, most: int, device: torch.device) -> Model:
-    """Return a model of so many Gaussians of a checkpoint, those of the largest opacity times length.
-
-    It has no SH beyond the DC. Memory holds no others.
-    """
-    assert source.progress is not None
-    chosen = joined(list(Selected(source, Selection(most=most, sh_degree=0)).blocks()))
-    x, y, z = source.space.offset
-    found = replace(chosen, comments=[f"comment offset {x!r} {y!r} {z!r}"])
-    table = trained_table(found, source.space, Ranks())
-    progress = replace(source.progress, sh_degree=0)
-    return model_of(TrainedModel(source.config, progress, source.space, table), device)
-
-
-def open_source(folder: Path, only: str | None = None) -> RunSource:
-    """Open the newest undamaged checkpoint of a run, or the one named `only`, without reading its Gaussians.
-
-    FileNotFoundError: the folder is no run, or holds no checkpoint. CheckpointError: all checkpoints are
-    damaged, or the newest is of another version or of another run.
-    """
-    run_files.check_is_run(folder)
-    alone = Ranks()
-    found = checkpoint.newest(
-        folder / run_files.CHECKPOINTS, alone, lambda path: checkpoint.sound_manifest(path, alone), only
-    )
-    if found is None:
-        raise FileNotFoundError(f"{folder} has no checkpoint yet; let the training finish or save one")
-    manifest, path, _ = found
-    check_own(folder, path, str(manifest.state.get("run", "")), alone)
-    progress, space, config = run_files.parsed(manifest.state, path)
-    run_files.compare_with_file(config, folder / run_files.CONFIG)
-    gate = lod_gate(config, progress)
-    trained = _Shards(path, manifest.shards, config, progress.step, space.extent, gate is not None)
-    exposed = False
-    if manifest.shared is not None:
-        with opened(path / manifest.shared.file) as shared:
-            exposed = SHARED_EXPOSURES in shared.keys()  # noqa: SIM118
-    return RunSource(trained, space, _comments(config, space, gate, exposed), config, progress)
-
-
-@dataclass
-class _Shards:
-    """The Gaussians of a checkpoint in the trained world, shard after shard, without pending steps."""
-
-    path: Path
-    shards: list[Shard]
-    config: Config
-    step: int
-    extent: float
-    has_levels: bool
-    comments: list[str] = field(default_factory=list)
-
-    def __len__(self) -> int:
-        return sum(shard.rows for shard in self.shards)
-
-    @property
-    def degree(self) -> int:
-        with opened(self.path / self.shards[0].file) as file:
-            return math.isqrt(file.get_slice("sh").get_shape()[1]) - 1
-
-    def blocks(self) -> Iterator[Gaussians]:
-        optimiser = TableAdam(self.config.optimiser, Schedule(self.config.schedule), self.extent, "cpu")
-        for shard in self.shards:
-            for first in range(0, shard.rows, gaussians.BLOCK):
-                last = min(first + gaussians.BLOCK, shard.rows)
-                with opened(self.path / shard.file) as file:
-                    rows = {name: file.get_slice(name)[first:last] for name in file.keys()}  # noqa: SIM118
-                table = GaussianTable(rows)
-                with torch.no_grad():
-                    optimiser.catch_up(table, None, self.step)
-                columns: dict[str, Any] = {name: table[name] for name in PARAMETERS}
-                yield Gaussians(**columns, levels=table["level"].float() if self.has_levels else None)
-
-
-def _comments(config: Config, space: Space, gate: LodGate | None, exposed: bool) -> list[str]:
-    """Return the header lines of a model's file, but that of its offset."""
-    lines = ["comment Generated by BlitzGS", "comment color space: sRGB, display-referred"]
-    if config.model.antialiased:
-        lines.append(MIP)
-    if exposed:
-        lines.append("comment exposure: mean of the training photographs")
-    if gate is not None:
-        lines.append(
-            f"comment lod reference_distance {gate.reference_distance * space.unit!r} fork {gate.fork!r} "
-            f"levels {gate.count} finest {gate.finest}" + (" smooth" if gate.smooth else "")
-        )
-    return lines

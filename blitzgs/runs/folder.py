@@ -22,10 +22,10 @@ from blitzgs.call import rasterization
 from blitzgs.config.fields import Config
 from blitzgs.config.files import load_config
 from blitzgs.distributed.group import Ranks, resolve_device
-from blitzgs.runs import run_files
+from blitzgs.runs import run_files, trained_model
 from blitzgs.runs.cameras import RunCamera, RunCameras, checked_camera, load_cameras
-from blitzgs.runs.log import LOG, records
-from blitzgs.runs.run_files import TrainedModel, model_gate
+from blitzgs.runs.log import records
+from blitzgs.runs.trained_model import TrainedModel
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.view.gate import ModelGate, centres_of
 from blitzgs.view.views import CameraLike, Space, render_options, viewmat
@@ -205,7 +205,7 @@ class RunFolder:
 
     def log(self) -> list[dict[str, Any]]:
         """Return the records of the log, oldest first, without incomplete lines."""
-        return list(records(self.path / LOG))
+        return list(records(self.path / run_files.LOG))
 
     def metrics(self) -> dict[str, dict[str, Any]]:
         """Return the evaluations: number of images seen, or split -> metrics, each view's under "views"."""
@@ -232,7 +232,7 @@ class RunFolder:
             CheckpointError: all checkpoints are damaged.
         """
         chosen, _ = resolve_device(str(device), local_rank=0, local_world_size=1, share_gpus=False)
-        found = run_files.open_model(self.path, Ranks(), only=checkpoint)
+        found = trained_model.open_model(self.path, Ranks(), only=checkpoint)
         return dataclasses.replace(model_of(found, chosen), run=self)
 
     @staticmethod
@@ -259,7 +259,7 @@ def model_of(found: TrainedModel, device: torch.device) -> Model:
     columns: dict[str, Any] = {name: found.table[name].to(device) for name in (*PARAMETERS, "level")}
     return Model(
         **columns,
-        lod=model_gate(found.config, found.progress, found.table, Ranks()),
+        lod=found.progress.model_gate(found.config, found.table, Ranks()),
         space=found.space,
         sh_degree=found.progress.sh_degree,
         config=found.config,

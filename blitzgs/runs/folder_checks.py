@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks the folder of a run: ranks can write to it, there is space, no other run uses it or wrote in it."""
+"""Checks the folder of a training: what is in it, who uses it, whether ranks can write, and space."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
-import json
 import os
 import secrets
 import shutil
@@ -16,11 +14,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs.cameras import CAMERAS
-from blitzgs.runs.checkpoint import CheckpointError
-from blitzgs.runs.log import LOG, records
+from blitzgs.runs.run_files import CHECKPOINTS, WRITTEN
 from blitzgs.table.table import GaussianTable
-from blitzgs.util.errors import warn
+from blitzgs.util import output
+from blitzgs.util.errors import UserError, warn
 from blitzgs.util.terminal import amount
 
 LOCK = ".lock"
@@ -29,7 +26,7 @@ LOCK_SECONDS = 5.0
 _PROBE_BYTES = 4096
 
 
-class FolderError(RuntimeError):
+class FolderError(UserError):
     """The folder of a run cannot be used; the message names the ranks and the reason."""
 
 
@@ -40,49 +37,64 @@ def locked(folder: Path, ranks: Ranks) -> Iterator[None]:
     The operating system releases the lock when the process ends, also after a crash. FolderError, on every
     rank: another process is training in the folder.
     """
-    descriptor, problem = None, None
-    if ranks.rank == 0:
-        folder.mkdir(parents=True, exist_ok=True)
-        descriptor, problem = _lock(folder / LOCK)
-    problem = ranks.broadcast_object(problem)
-    try:
-        if problem is not None:
+    with contextlib.ExitStack() as stack:
+        problem = None
+        if ranks.rank == 0:
+            folder.mkdir(parents=True, exist_ok=True)
+            problem = _lock(folder / LOCK, stack)
+        if (problem := ranks.broadcast_object(problem)) is not None:
             raise FolderError(problem)
         yield
-    finally:
-        if descriptor is not None:
-            os.close(descriptor)
 
 
-def _lock(path: Path) -> tuple[int | None, str | None]:
-    """Return the descriptor that holds the lock, or why there is none."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+def _lock(path: Path, stack: contextlib.ExitStack) -> str | None:
+    """Hold a lock until the stack ends; returns why it cannot be had; None, also where there are none."""
     deadline = time.monotonic() + LOCK_SECONDS
     while True:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            descriptor = stack.enter_context(output.locked(path))
             break
         except BlockingIOError:
             if time.monotonic() > deadline:
-                holder = os.pread(descriptor, 200, 0).decode(errors="replace").strip()
-                os.close(descriptor)
-                return None, (
-                    f"{path.parent} is in use by another run ({holder or 'of unknown name'}): wait for it, "
-                    "stop it, or choose another --out"
+                holder = path.read_text(errors="replace").strip() or "of unknown name"
+                return (
+                    f"{path.parent} is in use by another run ({holder}): wait for it, stop it, or choose "
+                    "another --out"
                 )
             time.sleep(0.1)
         except OSError as error:
             if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
                 raise
-            os.close(descriptor)
             warn(
                 f"{path.parent} is on a file system without locks ({error.strerror}): nothing keeps a second "
                 "run out of it"
             )
-            return None, None
+            return None
     os.ftruncate(descriptor, 0)
     os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
-    return descriptor, None
+    return None
+
+
+def check_unclaimed(folder: Path, resume: bool) -> None:
+    """Check that a run replaces nothing in its folder; a folder with checkpoints is a run's.
+
+    FileExistsError: the folder holds checkpoints and `resume` is not set, or files of another program that
+    have the names of a run's. NotADirectoryError: the folder or that of its checkpoints is a file.
+    """
+    try:
+        found = os.listdir(folder / CHECKPOINTS)
+    except FileNotFoundError:
+        for name in WRITTEN:
+            if os.path.lexists(folder / name):
+                raise FileExistsError(
+                    f"{folder} has {name}, which a run would replace, and no checkpoints: choose another "
+                    "--out"
+                ) from None
+        return
+    if not resume and any(name.startswith("checkpoint_") for name in found):
+        raise FileExistsError(
+            f"{folder} already holds a run: add --resume to continue it, or choose another --out"
+        )
 
 
 def check_writable(folder: Path, ranks: Ranks) -> None:
@@ -133,32 +145,3 @@ def check_room(folder: Path, table: GaussianTable, ranks: Ranks, most_gaussians:
         warn(
             f"{folder}: {amount(free)} are free; two checkpoints of {most:,} Gaussians take {amount(wanted)}"
         )
-
-
-def check_own(folder: Path, checkpoint: Path, run_id: str, ranks: Ranks) -> None:
-    """Check that a checkpoint was written by the run whose cameras and log are in `folder`. Collective.
-
-    CheckpointError, on every rank: it was written by another run. Old checkpoints have no id and are not
-    checked.
-    """
-    known = ranks.broadcast_object(known_id(folder) if ranks.rank == 0 else "")
-    if known and run_id and known != run_id:
-        raise CheckpointError(
-            f"{checkpoint} was written by another run ({run_id}) than the one in {folder} ({known}), whose "
-            "cameras would be used with it: put back this run's own checkpoints, or use the folder of the "
-            "other run"
-        )
-
-
-def known_id(folder: Path) -> str:
-    """Return the id of the run in a folder, from its cameras, else from its log; empty if it is not known."""
-    try:
-        found = json.loads((folder / CAMERAS).read_text(encoding="utf-8")).get("run", "")
-    except (OSError, ValueError, AttributeError, RecursionError):
-        found = ""
-    if isinstance(found, str) and found:
-        return found
-    with contextlib.suppress(OSError):
-        found = [record["run"] for record in records(folder / LOG) if isinstance(record.get("run"), str)]
-        return found[-1] if found else ""
-    return ""

@@ -14,13 +14,14 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.frame.render import Frame
 from blitzgs.table.table import PARAMETERS, GaussianTable
+from blitzgs.util.errors import UserError
 
 
-class NonFiniteError(RuntimeError):
+class NonFiniteError(UserError):
     """A value is NaN or infinite; the message names the step, the view, and the op or column."""
 
 
-class ModelLostError(RuntimeError):
+class ModelLostError(UserError):
     """No Gaussian is left; the message names a remedy."""
 
 

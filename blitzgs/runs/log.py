@@ -13,6 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from datetime import timedelta
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Column
 
+from blitzgs.runs.run_files import LOG
 from blitzgs.util.errors import warn
 from blitzgs.util.output import write_file
 from blitzgs.util.progress import Report, lines
 from blitzgs.util.terminal import printable
 
-LOG = "log.jsonl"
 BOARD = "tensorboard"
 # Largest number of records that are kept while the disk is full; then the oldest are dropped.
 _MAX_WAITING = 10_000
@@ -86,7 +87,7 @@ class RunLog:
             folder.mkdir(parents=True, exist_ok=True)
             _drop_repeated(folder / LOG, run_id, done, total)
         self._file = _JsonLines(folder / LOG, self._failures)
-        if tensorboard:
+        if tensorboard and find_spec("tensorboard") is not None:
             self._board = _Board(folder / BOARD, done, self._failures)
         if self.console.is_terminal:
             bar = [BarColumn(bar_width=8)] if self.console.width >= 60 else []
@@ -214,37 +215,28 @@ class _JsonLines:
 
 
 class _Board:
+    """TensorBoard's events."""
+
     def __init__(self, folder: Path, done: int, failures: _Failures) -> None:
         self._folder, self._done, self._failures = folder, done, failures
         self._writer: Any = None
-        self._open()
 
     def add(self, t: int, values: Mapping[str, float]) -> None:
         with self._failures.tolerated("TensorBoard"):
-            if self._writer is None:
-                self._open()
-            try:
-                for name, value in values.items():
-                    if self._writer is not None:
-                        self._writer.add_scalar(name, value, t)
-            except Exception:
-                # The writer's thread has ended with an error; the next record makes a new writer.
-                self._writer = None
-                raise
+            from torch.utils.tensorboard import SummaryWriter
+
+            # Drop the steps after `done` that an interrupted run has logged: they will be logged again.
+            purge = self._done + 1 if self._done else None
+            writer = self._writer or SummaryWriter(str(self._folder), purge_step=purge)
+            self._writer = None  # after an error its thread has ended, and the next record makes a new one
+            for name, value in values.items():
+                writer.add_scalar(name, value, t)
+            self._writer = writer
 
     def close(self) -> None:
         with self._failures.tolerated("TensorBoard"):
             if self._writer is not None:
                 self._writer.close()
-
-    def _open(self) -> None:
-        try:
-            from torch.utils.tensorboard import SummaryWriter
-        except ImportError:
-            return
-        with self._failures.tolerated("TensorBoard"):
-            # Drop the steps after `done` that an interrupted run has logged: they will be logged again.
-            self._writer = SummaryWriter(str(self._folder), purge_step=self._done + 1 if self._done else None)
 
 
 class _Failures:
@@ -257,7 +249,7 @@ class _Failures:
     def tolerated(self, kind: str) -> Iterator[None]:
         try:
             yield
-        except (OSError, ValueError, RuntimeError) as error:
+        except (OSError, ValueError, RuntimeError, ImportError) as error:
             if kind not in self._warned:
                 self._warned.add(kind)
                 with contextlib.suppress(OSError):

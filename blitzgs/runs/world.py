@@ -152,5 +152,5 @@ def subject_of_file(
     """
     table, gate = trained_table(found, space, ranks), gate_of(found, space.unit)
     options = render_options(config, space, found.degree, gate)
-    lod = None if gate is None else ModelGate(gate, math.inf if gate.smooth else most_kept, table, ranks)
+    lod = None if gate is None else ModelGate(gate, most_kept, table, ranks)
     return Subject(table, options, space, lod)

@@ -14,10 +14,11 @@ from torch import Tensor
 
 from blitzgs.ops.rows import take_rows
 from blitzgs.table.table import GROWTH, GaussianTable
+from blitzgs.util.errors import UserError
 from blitzgs.util.terminal import amount
 
 
-class HostMemoryError(RuntimeError):
+class HostMemoryError(UserError):
     """The host has too little memory for the table; the message names the sizes and a remedy."""
 
 

@@ -31,6 +31,7 @@ from blitzgs.table.table import (
     sectors_in,
     stored_rows,
 )
+from blitzgs.util.errors import UserError
 from blitzgs.util.terminal import amount
 
 # Columns that steps change and that are therefore written back to the host.
@@ -41,7 +42,7 @@ _SETTING = "memory.resident_gb (eval, render: --resident-gb)"
 _FREE = -1
 
 
-class PoolError(RuntimeError):
+class PoolError(UserError):
     """The blocks that views see do not fit into the pool; the message names the sizes and a remedy."""
 
 

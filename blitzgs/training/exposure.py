@@ -17,7 +17,8 @@ from blitzgs.capture import colmap
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.images import ImageStore
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs.cameras import EXPOSURES, SHARED_EXPOSURES, effective_exposures
+from blitzgs.runs.cameras import SHARED_EXPOSURES, effective_exposures
+from blitzgs.runs.run_files import EXPOSURES
 from blitzgs.training.batches import Batch
 from blitzgs.util.output import write_file
 

@@ -21,7 +21,8 @@ from blitzgs.distributed.host_sum import HostSum
 from blitzgs.frame.render import Frame
 from blitzgs.ops.host import HostCopy
 from blitzgs.runs.guard import check_table, find_bad
-from blitzgs.runs.log import LOG, records
+from blitzgs.runs.log import records
+from blitzgs.runs.run_files import LOG, PICTURE
 from blitzgs.training.batches import Batch
 from blitzgs.training.loss import batch_psnr, opacity_term, photometric, scale_term
 from blitzgs.training.state import TrainingState
@@ -29,7 +30,6 @@ from blitzgs.util.charts import line_chart
 from blitzgs.util.errors import warn
 from blitzgs.util.output import write_file
 
-PICTURE = "trajectory.svg"
 _MILESTONES = ("initial", "before_pass_1", "after_pass_1", "peak", "before_pass_2", "after_pass_2", "final")
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import secrets
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,10 +22,11 @@ from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import INITIAL_OPACITY, octree_gaussians
 from blitzgs.population.relocation import PositionNoise
 from blitzgs.runs import run_files
-from blitzgs.runs.cameras import CAMERAS, EXPOSURES, SHARED_EXPOSURES, save_cameras, warn_of_changes
-from blitzgs.runs.folder_checks import check_room, check_writable
-from blitzgs.runs.log import LOG, RunLog
-from blitzgs.runs.run_files import Progress
+from blitzgs.runs.cameras import SHARED_EXPOSURES, save_cameras, warn_of_changes
+from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writable
+from blitzgs.runs.log import RunLog
+from blitzgs.runs.resume import check_resumable, decided_as, with_pace_of
+from blitzgs.runs.trained_model import Progress, TrainedModel, restore
 from blitzgs.runs.world import check_seen, save_world_frame, trained_columns
 from blitzgs.spawn.gate import lineage_subject, open_spawn_gate
 from blitzgs.spawn.lineage import Ledger, Lineage, initial_births
@@ -40,7 +40,6 @@ from blitzgs.training.exposure import Exposures, exposures_differ, track_gains
 from blitzgs.training.inputs import check_alike, check_capture, check_resolution
 from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
-from blitzgs.training.records import PICTURE
 from blitzgs.training.sampler import BatchSampler, tour_of
 from blitzgs.training.state import Curve, TrainingState
 from blitzgs.training.step import Stepper
@@ -84,7 +83,7 @@ def set_up(
     space = Space.of(capture.offset, capture.extent)
     lap("checks")
     home = torch.device("cpu") if config.memory.resident_gb > 0 else ranks.device
-    restored = run_files.restore(folder, ranks, home) if resume else None
+    restored = restore(folder, ranks, home) if resume else None
     config = _continued(_resolved(config, capture, restored), restored, extend, folder)
     schedule = Schedule(config.schedule)
     if restored is None:
@@ -143,71 +142,34 @@ def set_up(
     )
 
 
-# What a run writes beside its checkpoints.
-_WRITTEN = (
-    run_files.CONFIG, CAMERAS, LOG, run_files.SUMMARY, PICTURE, run_files.LINEAGE, run_files.REPORT, EXPOSURES
-)  # fmt: skip
-
-
-def check_unclaimed(folder: Path, resume: bool) -> None:
-    """Check that a run replaces nothing in its folder; a folder with checkpoints is a run's.
-
-    FileExistsError: the folder holds checkpoints and `resume` is not set, or files of another program that
-    have the names of a run's. NotADirectoryError: the folder or that of its checkpoints is a file.
-    """
-    try:
-        found = os.listdir(folder / run_files.CHECKPOINTS)
-    except FileNotFoundError:
-        for name in _WRITTEN:
-            if os.path.lexists(folder / name):
-                raise FileExistsError(
-                    f"{folder} has {name}, which a run would replace, and no checkpoints: choose another "
-                    "--out"
-                ) from None
-        return
-    if not resume and any(name.startswith("checkpoint_") for name in found):
-        raise FileExistsError(
-            f"{folder} already holds a run: add --resume to continue it, or choose another --out"
-        )
-
-
 def _describe(folder: Path, config: Config, capture: Capture, run_id: str, is_new: bool) -> None:
     save_config(config, folder / run_files.CONFIG)
-    if is_new or not (folder / CAMERAS).exists():
+    if is_new or not (folder / run_files.CAMERAS).exists():
         save_cameras(folder, capture, run_id)
     if is_new and capture.about.frame is not None:
         save_world_frame(folder, capture.about.frame)
 
 
-def _resolved(config: Config, capture: Capture, restored: run_files.TrainedModel | None) -> Config:
+def _resolved(config: Config, capture: Capture, restored: TrainedModel | None) -> Config:
     """Return `config` with the values that depend on the training views and on what the run has measured.
 
     The depths of what the views see decide on the near plane (`model.near`). The number of views decides the
     length of the run (`schedule.images_per_view`) and the opacity term (`loss.opacity_total`). A run that is
     resumed with fewer or more photographs (`data.allow_missing`) keeps the values that it began with.
-    `run_files.with_pace_of` says what a run measures.
+    `with_pace_of` says what a run measures.
     """
-    schedule, loss = config.schedule, config.loss
-    if restored is not None:
-        known, own = restored.progress.train_views, restored.config
-        if known not in ("", train_views_fingerprint(capture)):
-            if schedule.images_per_view > 0:
-                schedule = replace(schedule, scale=own.schedule.scale, images_per_view=0.0)
-            if loss.opacity_total > 0:
-                loss = replace(loss, opacity=own.loss.opacity, opacity_total=0.0)
-    model = config.model
+    saved = None if restored is None else restored.config
+    if restored is not None and restored.progress.train_views not in ("", train_views_fingerprint(capture)):
+        config = decided_as(restored.config, config)
+    model, views = config.model, len(capture.train)
     if model.near == 0:
         # Relative to the extent of this capture: a photograph that is lost later does not move the plane.
-        near = capture.near / capture.extent if restored is None else restored.config.model.near
-        model = replace(model, near=near)
-    views = len(capture.train)
-    config = replace(config, model=model, schedule=stretched(schedule, views), loss=weighted(loss, views))
-    return run_files.with_pace_of(config, None if restored is None else restored.config)
+        model = replace(model, near=capture.near / capture.extent if saved is None else saved.model.near)
+    schedule, loss = stretched(config.schedule, views), weighted(config.loss, views)
+    return with_pace_of(replace(config, model=model, schedule=schedule, loss=loss), saved)
 
 
-def _continued(
-    config: Config, restored: run_files.TrainedModel | None, extend: float | None, folder: Path
-) -> Config:
+def _continued(config: Config, restored: TrainedModel | None, extend: float | None, folder: Path) -> Config:
     """Return the configuration to begin or continue a run with: `config`, or one with a longer schedule."""
     if restored is None:
         if extend is not None:
@@ -216,11 +178,11 @@ def _continued(
     if extend is not None:
         # An interrupted extension may have left its schedule in the folder's configuration.
         config = replace(config, schedule=restored.config.schedule)
-    run_files.check_resumable(restored.config, config)
+    check_resumable(restored.config, config)
     return config if extend is None else extended(config, restored.progress.step, extend)
 
 
-def _tile_owners(ranks: Ranks, progress: Progress, restored: run_files.TrainedModel | None) -> TileOwners:
+def _tile_owners(ranks: Ranks, progress: Progress, restored: TrainedModel | None) -> TileOwners:
     """Return the division of tiles, with the costs that the checkpoint has if they can be used."""
     owners = TileOwners(ranks)
     if restored is None or "bounds" not in restored.shared or ranks.world_size == 1:
@@ -236,7 +198,7 @@ def _exposures(
     images: ImageStore,
     ranks: Ranks,
     progress: Progress,
-    restored: run_files.TrainedModel | None,
+    restored: TrainedModel | None,
 ) -> Exposures | None:
     """Return the photographs' exposures, from the checkpoint or the tracks; None if they are equal."""
     exposures = Exposures(capture.train, ranks)
@@ -296,7 +258,7 @@ def _start_lineage(
     return lineage
 
 
-def _origin(restored: run_files.TrainedModel | None, resume: bool, folder: Path, schedule: Schedule) -> str:
+def _origin(restored: TrainedModel | None, resume: bool, folder: Path, schedule: Schedule) -> str:
     """Describe where the run begins, for the log."""
     if restored is not None:
         more = ""

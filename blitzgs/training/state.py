@@ -22,7 +22,7 @@ from blitzgs.frame.ownership import TileOwners
 from blitzgs.frame.render import RenderOptions
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs.log import RunLog
-from blitzgs.runs.run_files import Progress, lod_gate, model_gate
+from blitzgs.runs.trained_model import Progress
 from blitzgs.spawn.candidates import Veto
 from blitzgs.spawn.lineage import Lineage
 from blitzgs.table.table import GaussianTable
@@ -137,12 +137,12 @@ class TrainingState:
     @property
     def render_options(self) -> RenderOptions:
         """The render options at the run's present spherical-harmonics degree."""
-        lod = lod_gate(self.config, self.progress)
+        lod = self.progress.lod_gate(self.config)
         return render_options(self.config, self.space, self.progress.sh_degree, lod)
 
     def subject(self) -> Subject:
         """Return what views of the present model are rendered from. Collective if there is an LOD gate."""
-        lod = model_gate(self.config, self.progress, self.table, self.ranks)
+        lod = self.progress.model_gate(self.config, self.table, self.ranks)
         return Subject(self.stepper.gaussians, self.render_options, self.space, lod)
 
     def start_clock(self) -> None:

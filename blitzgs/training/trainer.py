@@ -26,7 +26,6 @@ from blitzgs.population.importance import PHI
 from blitzgs.runs import run_files
 from blitzgs.runs.guard import LossGuard, ModelLostError
 from blitzgs.runs.log import RunLog
-from blitzgs.runs.run_files import lod_gate
 from blitzgs.spawn.gate import lineage_subject
 from blitzgs.table.pool import PoolError
 from blitzgs.training import view_level
@@ -241,7 +240,7 @@ class Trainer:
         degree = max(state.progress.sh_degree, schedule.sh_degree(begin, config.model.sh_degree))
         view_level.follow_schedule(state, begin)
         view_filter = view_level.batch_gate(state, batch.indices)
-        options = render_options(config, state.space, degree, lod_gate(config, state.progress))
+        options = render_options(config, state.space, degree, state.progress.lod_gate(config))
         frame, terms, sums = state.stepper.forward(step, options, batch, view_filter=view_filter)
         self._write_record()  # whose figures were copied meanwhile
         names = [state.capture.cameras[i].name for i in batch.indices]

@@ -9,12 +9,12 @@ import math
 from blitzgs.capture.capture import Capture, train_views_fingerprint
 from blitzgs.config.schedule import Event
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs.run_files import Progress, level_fork, lod_gate, model_gate
+from blitzgs.runs.trained_model import Progress
 from blitzgs.table.table import CULL, GaussianTable
 from blitzgs.training.state import TrainingState
 from blitzgs.util.errors import warn
 from blitzgs.view.gate import ViewGate, lod_bits
-from blitzgs.view.levels import FOOTPRINT_LEVELS, footprint_levels, footprint_sizes
+from blitzgs.view.levels import FOOTPRINT_LEVELS, footprint_levels, footprint_sizes, level_fork
 
 
 def follow_schedule(state: TrainingState, begin: int) -> None:
@@ -62,7 +62,7 @@ def choose_views(state: TrainingState) -> None:
     state.catch_up()  # the prediction reads the means
     # Without the earlier choice, by which the gate may be closed.
     unchosen = dataclasses.replace(state.progress, gated_views="", least_kept=0.0)
-    gate = model_gate(state.config, unchosen, state.table, state.ranks)
+    gate = unchosen.model_gate(state.config, state.table, state.ranks)
     assert gate is not None  # the gate is open
     kept = gate.kept(state.views.centres(state.capture.train))
     gated = [gate.applies(share) for share in kept]
@@ -101,7 +101,7 @@ def keep_to_views(table: GaussianTable, progress: Progress, capture: Capture, ra
 def batch_gate(state: TrainingState, indices: list[int]) -> ViewGate | None:
     """Return LOD gate and cull mask of training views (indices into the capture); None: there is neither."""
     columns = [state.columns[index] for index in indices]
-    lod, flags = lod_gate(state.config, state.progress), state.progress.gated_views
+    lod, flags = state.progress.lod_gate(state.config), state.progress.gated_views
     lod_views = 0 if lod is None else lod_bits([flags[column] == "1" for column in columns])
     masked = state.config.view.cull and CULL in state.table
     if not (lod_views or masked):

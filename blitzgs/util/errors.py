@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a user is told: warnings and errors at the right place, arguments of a wrong type, too little memory.
 
-Torch is imported where it is needed, as what warns may do without.
+Packages are imported where they are needed, as what warns may do without.
 """
 
 from __future__ import annotations
@@ -15,12 +15,14 @@ from importlib import import_module
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
-import psutil
-
 from blitzgs.util.terminal import amount
 
 if TYPE_CHECKING:
     import torch
+
+
+class UserError(RuntimeError):
+    """An error that a user can cause and correct: commands print its message, without a traceback."""
 
 
 # Between a line of this package and its caller are contexts, and what torch wraps a function in.
@@ -33,6 +35,24 @@ def warn(text: str, category: type[Warning] = UserWarning) -> None:
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _PASSED:
         level, frame = level + 1, frame.f_back
     warnings.warn(text, category, stacklevel=level + 1)
+
+
+@contextmanager
+def kept_warnings() -> Iterator[list[str]]:
+    """Yield a list that gets the texts of all warnings inside the context, which are shown as usual."""
+    texts: list[str] = []
+    usual = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        if issubclass(category, UserWarning):
+            texts.append(str(message))
+        usual(message, category, *place, **more)
+
+    warnings.showwarning = show
+    try:
+        yield texts
+    finally:
+        warnings.showwarning = usual
 
 
 @contextmanager
@@ -111,4 +131,6 @@ def _free(device: torch.device) -> int:
 
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
+    import psutil
+
     return int(psutil.virtual_memory().available)

@@ -7,24 +7,16 @@ equal when their suffix is replaced. `OutputFolder` makes paths of them for whic
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import hashlib
 import os
 import re
 import secrets
-import shutil
 import stat
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING
-
-from blitzgs.util.terminal import amount
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 # A file that `OutputFolder` leaves in its folder. Where it is missing, existing files belong to another
 # program or to the user.
@@ -227,11 +219,6 @@ def check_outside(path: Path, inputs: Path) -> None:
         raise ValueError(f"{path} is in {inputs}, whose files are read: choose a folder outside it")
 
 
-def is_lack_of_space(error: OSError) -> bool:
-    """Tell whether an error would not have happened with more space on the disk."""
-    return error.errno in (errno.ENOSPC, errno.EDQUOT)
-
-
 @contextmanager
 def locked(path: Path, busy: str = "") -> Iterator[int]:
     """Hold the lock of a folder, or of a file that is made for it; yields its descriptor.
@@ -257,20 +244,3 @@ def sync_to_disk(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def check_space(folder: Path, columns: Mapping[str, Tensor]) -> None:
-    """Raise the error of a full disk if columns do not fit into the free space."""
-    needed = sum(column.numel() * column.element_size() for column in columns.values())
-    free = shutil.disk_usage(folder).free
-    if free < needed:
-        raise OSError(errno.ENOSPC, f"{amount(needed)} are needed and {amount(free)} are free", str(folder))
-
-
-def explain(error: OSError) -> str:
-    """Return why a file was not written, and what to do where that is known."""
-    if is_lack_of_space(error):
-        return f"the disk is full ({error}); free some space or lower the number of checkpoints kept"
-    if error.errno == errno.EFBIG:
-        return f"a file is larger than is allowed ({error}); raise the limit (ulimit -f) or use another disk"
-    return str(error)

@@ -98,7 +98,10 @@ class ModelGate:
         self, gate: LodGate, most_kept: float, table: GaussianTable, ranks: Ranks, least_kept: float = 0.0
     ) -> None:
         """Draw the sample. Collective: every rank calls this with its share of the Gaussians, caught up."""
-        self.gate, self.most_kept, self.least_kept, self._ranks = gate, most_kept, least_kept, ranks
+        self.gate, self._ranks = gate, ranks
+        # With smooth levels every view has the gate: a change from a view with it to one without would be a
+        # visible jump.
+        self.most_kept, self.least_kept = (math.inf, 0.0) if gate.smooth else (most_kept, least_kept)
         device = ranks.device  # the table may be on another device
         count = int(ranks.all_reduce(torch.tensor([len(table)], device=device)).item())
         chosen = uniform(table["id"], _SAMPLE_KEY) < SAMPLE / max(count, 1)

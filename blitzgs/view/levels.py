@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from blitzgs.config.fields import FORK, Config
 from blitzgs.table.blocks import morton_order
 
 # Finest sensible voxel relative to the box of the points; it sets the coarsest level's size.
@@ -52,6 +53,11 @@ def farthest(level: int, reference_distance: float, fork: float) -> float:
     `level`: l. `reference_distance`: d_0. `fork`: f.
     """
     return math.inf if level == 0 else reference_distance * fork ** (0.5 - level)
+
+
+def level_fork(config: Config) -> float:
+    """Return the ratio of the distances of neighbouring levels of a run's LOD gate."""
+    return FORK ** (1 / FOOTPRINT_STEPS) if config.view.footprint > 0 else FORK
 
 
 def footprint_sizes(scales: Tensor, opacities: Tensor) -> Tensor:

@@ -21,8 +21,8 @@ from blitzgs.formats.selection import Selected, Selection
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import stored_cameras
-from blitzgs.runs.export import largest_of_run, open_source
 from blitzgs.runs.folder import open_run, subject_of
+from blitzgs.runs.source import largest_of_run, open_source
 from blitzgs.runs.world import load_world_frame, subject_of_file
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.view.draw import Drawer

@@ -24,7 +24,7 @@ from blitzgs.frame.render import RenderOptions
 from blitzgs.runs import run_files
 from blitzgs.runs.cameras import stored_cameras
 from blitzgs.runs.clean import contributions as measured
-from blitzgs.runs.export import open_source
+from blitzgs.runs.source import open_source
 from blitzgs.runs.world import load_world_frame
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import PARAMETERS, GaussianTable

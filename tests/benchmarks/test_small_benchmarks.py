@@ -22,9 +22,10 @@ from blitzgs import rasterization
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply
 from blitzgs.formats.tiles import write_tiles
-from blitzgs.runs import run_files
+from blitzgs.runs import trained_model
 from blitzgs.training import setup
 from blitzgs.training.trainer import Trainer
+from blitzgs.view import levels
 from blitzgs_synth.flight import plan_flight
 from blitzgs_synth.plan import PRESETS, Plan
 from blitzgs_synth.render import City
@@ -112,7 +113,7 @@ FLAGS = ("schedule.iterations=60", "view.lod=true", "schedule.densify_until=40")
 def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("popping") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        for module in (setup, run_files):  # levels so near that the tiny scene has several
+        for module in (setup, levels):  # levels so near that the tiny scene has several
             patch.setattr(module, "FORK", 1.3)
         Trainer(tiny_config(*FLAGS), *tiny_scene(), folder, Ranks()).train()
         yield folder
@@ -137,14 +138,14 @@ def test_smooth_levels_pop_less(trained, tmp_path, device, capsys):
 
 
 def test_a_model_of_one_level_does_not_pop(trained, monkeypatch):
-    opened = run_files.open_model
+    opened = trained_model.open_model
 
     def flat(*arguments):
         model = opened(*arguments)
         model.table["level"].zero_()
         return model
 
-    monkeypatch.setattr(run_files, "open_model", flat)
+    monkeypatch.setattr(trained_model, "open_model", flat)
     found = bm_popping.popping(trained, None, frames=4)
     assert found["gated"]["largest"] == 0 < found["full"]["mean_change"]
     assert found["smooth"]["largest"] < 1e-3  # opacities that went through a logit and back

@@ -20,7 +20,7 @@ from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.models import FORMATS, read_gaussians
 from blitzgs.formats.ply import write_ply
-from blitzgs.runs.run_files import open_model
+from blitzgs.runs.trained_model import open_model
 from blitzgs.runs.world import load_world_frame
 from blitzgs.viewer.panel import overlay
 from blitzgs.viewer.studio import open_model as open_viewed

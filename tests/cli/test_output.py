@@ -16,9 +16,9 @@ import pytest
 import torch
 
 from blitzgs._built import LIBRARY_DIR
-from blitzgs.cli import _NAMED_ERRORS, COMMANDS, _user_errors, doctor, main
+from blitzgs.cli import COMMANDS, doctor, main
+from blitzgs.cli import doctor_probes as probes
 from blitzgs.cli.completion import script
-from tests.helpers import refused
 from tests.training.tiny import OVERRIDES, as_flags
 
 TRAIN = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.3", "log.every=1")
@@ -101,10 +101,6 @@ def test_help_needs_no_torch(arguments):
     if not arguments:
         listed = set(re.findall(r"^    (\w+)", done.stderr, re.MULTILINE))
         assert listed == set(COMMANDS)  # the whole help, not only the usage
-
-
-def test_the_errors_that_are_messages_exist():
-    assert len(_user_errors()) == len(set(_user_errors())) > len(_NAMED_ERRORS)
 
 
 @pytest.mark.parametrize("moment", ["blitzgs.cli.import_module", "blitzgs.cli.train.open_capture"])
@@ -205,14 +201,12 @@ def test_zsh_completes_by_the_script_of_bash(tmp_path):
 ROOT = Path(__file__).resolve().parents[2]
 # The requirement of the sources: an editable installation may be older than they are.
 REQUIREMENTS = re.findall(r'"(torch>=2\.11,<2\.14)"', (ROOT / "pyproject.toml").read_text())
-GOOD = {"image_error": 1e-6, "gradient_error": 1e-5, "seconds": 0.1}
 
 
-def report(*arguments, path=None, **variables):
-    """Run the command; return its exit status and its lines by name. `path` precedes the import path."""
-    environment = os.environ | variables | ({"PYTHONPATH": str(path)} if path else {})
+def report(*arguments, **variables):
+    """Run the command; return its exit status and its lines by name."""
     command = [sys.executable, "-m", "blitzgs", "doctor", "--json", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=ROOT)
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | variables, cwd=ROOT)
     found = json.loads(done.stdout)
     return done.returncode, {line["name"]: line for line in found["lines"]}
 
@@ -274,28 +268,13 @@ def test_a_library_that_does_not_load_is_named(tmp_path):
     assert lines["render cpu"]["state"] == "failed"
 
 
-def test_a_process_that_hangs_is_ended_with_its_children(tmp_path, monkeypatch):
-    monkeypatch.setattr(doctor, "TIMEOUT", 1)
-    command = ["bash", "-c", f"sleep 300 & echo $! > {tmp_path}/child; wait"]
-    refused(doctor.ProbeError, "no answer within 1 s", doctor.run_command, command)
-    child = int((tmp_path / "child").read_text())
-    state = Path(f"/proc/{child}/stat")
-    deadline = time.monotonic() + 10
-    while state.exists() and state.read_text().split()[2] != "Z" and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not state.exists() or state.read_text().split()[2] == "Z"
-
-
-def torch_of(version, **more):
-    return {"version": version, "cuda": None, "threads": 2, "gpus": [], "nccl": None} | more
-
-
 @pytest.mark.parametrize(
     "version, state", [("2.10.1", "failed"), ("2.11.0+cu130", "ok"), ("2.13.0", "ok"), ("2.14.0", "warning")]
 )
 def test_the_bounds_of_torch(version, state, monkeypatch):
     monkeypatch.setattr(doctor.metadata, "requires", lambda _: REQUIREMENTS)
-    monkeypatch.setattr(doctor, "probe", lambda *_: torch_of(version))
+    found = {"version": version, "cuda": None, "threads": 2, "gpus": [], "nccl": None}
+    monkeypatch.setattr(doctor, "probe", lambda _: found)
     assert doctor._torch().state == state
 
 
@@ -317,41 +296,30 @@ def test_the_remedy_names_the_bounds_that_are_known(requirements, remedy, monkey
     assert doctor._torch().remedy == remedy
 
 
-@pytest.mark.parametrize(
-    "name, value", [("image_error", 1e-2), ("gradient_error", 1e-2), ("image_error", float("nan"))]
-)
-def test_a_wrong_rendering_fails(name, value, monkeypatch, capsys):
-    monkeypatch.setattr(doctor, "probe", lambda *_, **__: GOOD | {name: value})
-    line = doctor._render("cpu")
-    assert line.state == "failed" and line.remedy
-    monkeypatch.setattr(doctor, "examine", lambda *_: [line])
+@pytest.mark.parametrize("errors", [(1e-2, 1e-5), (1e-6, 1e-2), (float("nan"), 1e-5)])
+def test_a_wrong_rendering_fails(errors, monkeypatch, capsys):
+    assert probes.rendered(1e-6, 1e-5, 0.1)["state"] == "ok"
+    found = probes.rendered(*errors, 0.1)
+    assert found["state"] == "failed" and found["remedy"]
+    monkeypatch.setattr(doctor, "examine", lambda *_: [doctor.Line("render cpu", **found)])
     assert main(["doctor"]) == 1
     assert "1 faults" in capsys.readouterr().out
-    monkeypatch.setattr(doctor, "probe", lambda *_, **__: GOOD)
-    assert doctor._render("cpu").state == "ok"
 
 
 def test_ranks_that_differ_fail(monkeypatch):
-    part = {"differing_values": 0, "covered": 0.5, "seconds": 0.1, "backend": "gloo"}
-    monkeypatch.setattr(
-        doctor, "probe", lambda name, device, rank, *_, **__: part | {"differing_values": int(rank)}
-    )
-    assert doctor._exchange("cpu").state == "failed"
+    part = {"covered": 0.5, "seconds": 0.1, "backend": "gloo"}
+    monkeypatch.setattr(doctor, "probe", lambda _, __, rank, ___: part | {"differing_values": int(rank)})
+    assert doctor._exchange("cpu")["state"] == "failed"
 
 
-def test_a_gpu_that_the_library_was_not_built_for(monkeypatch, tmp_path):
-    (tmp_path / "libblitzgs_cuda.so").write_bytes(b"library")
-    monkeypatch.setattr(doctor, "LIBRARY_DIR", tmp_path)
-    found = {"cuda": "13.0.88", "architectures": "80-real,86-real,90-real,120", "ops": "0"}
-    monkeypatch.setattr(doctor, "probe", lambda *_, **__: dict(found))
-    states = [doctor._library("cuda", [{"architecture": f"sm_{n}"}]).state for n in (80, 90, 120, 87)]
-    assert states == ["ok", "ok", "ok", "warning"]
+def test_a_gpu_that_the_library_was_not_built_for():
+    built = "80-real,86-real,90-real,120"
+    assert probes.foreign(built, ["sm_80", "sm_90", "sm_120", "sm_87"]) == ["sm_87"]
+    assert probes.foreign("native", ["sm_87"]) == []
 
 
-def test_a_slow_disk_is_a_warning(monkeypatch):
-    found = {"write_mb_s": 12.0, "read_mb_s": 200.0, "free_bytes": 10**9}
-    monkeypatch.setattr(doctor, "probe", lambda *_, **__: found)
-    assert doctor._disk(Path("/")).state == "warning"
+def test_a_slow_disk_is_a_warning():
+    assert probes.measured("/", 12.0, 200.0)["state"] == "warning"
 
 
 def test_optional_packages_name_their_extra(monkeypatch):

@@ -19,7 +19,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import mass_prefix, smallest
 from blitzgs.ops.counter_random import sampling_keys
 from blitzgs.reference.render import top_mass
-from blitzgs.runs import run_files
+from blitzgs.runs import trained_model
 from tests.distributed.rank_harness import RankError, on_each_device, run_ranks
 from tests.helpers import PARAMETERS, random_scene, rasterize_scene, refused, relative_error
 from tests.training.tiny import OVERRIDES, as_flags, write_tiny_capture
@@ -307,7 +307,7 @@ def test_a_host_is_lost_and_both_resume(tmp_path):
         text = (tmp_path / "first").read_text()
         assert "rank" in text and ("has stopped reporting" in text or "connection" in text)
         lose(hosts[0])  # where torchrun still waits for the other host
-        saved = run_files.restore(out, Ranks()).progress.step
+        saved = trained_model.restore(out, Ranks()).progress.step
         assert 0 < saved < 1500
 
         port = free_port()
@@ -323,4 +323,4 @@ def test_a_host_is_lost_and_both_resume(tmp_path):
                 lose(host)
     text = (tmp_path / "third").read_text()
     assert "resumed from checkpoint_" in text and f"after {saved:,} steps" in text
-    assert run_files.restore(out, Ranks()).progress.step == 1500
+    assert trained_model.restore(out, Ranks()).progress.step == 1500

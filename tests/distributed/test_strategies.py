@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs import run_files
+from blitzgs.runs import run_files, trained_model
 from blitzgs.training.events import densify
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
@@ -54,7 +54,7 @@ def test_a_resumed_run_is_the_same(whole, tmp_path):
     options, folder, base = whole
     shutil.copytree(base, tmp_path / "run")
     _train(Ranks(), tmp_path / "run", *options)
-    resumed, expected = (run_files.restore(f, Ranks()).table for f in (tmp_path / "run", folder))
+    resumed, expected = (trained_model.restore(f, Ranks()).table for f in (tmp_path / "run", folder))
     for name in expected:
         assert torch.equal(resumed[name], expected[name]), name
 
@@ -67,7 +67,7 @@ def test_cuda_trains_with_each_option_and_resumes_exactly(name, tmp_path):
     _train(ranks, tmp_path / "whole", *options)
     shutil.copytree(tmp_path / "whole" / FIRST, tmp_path / "run" / FIRST)
     _train(ranks, tmp_path / "run", *options)
-    resumed, expected = (run_files.restore(tmp_path / f, Ranks()).table for f in ("run", "whole"))
+    resumed, expected = (trained_model.restore(tmp_path / f, Ranks()).table for f in ("run", "whole"))
     for column in expected:
         assert torch.equal(resumed[column], expected[column]), column
     events = events_of(tmp_path / "whole", "densify")
@@ -112,4 +112,4 @@ def test_births_less_deaths_are_the_living(whole, tmp_path):
     relocated = log["deaths"]["id"][log["deaths"]["cause"] == Cause.RELOCATED]
     living = set(log["births"]["id"].tolist()) - set(log["deaths"]["id"].tolist())
     assert len(relocated) > 5
-    assert living == set(run_files.restore(tmp_path, Ranks()).table["id"].tolist())
+    assert living == set(trained_model.restore(tmp_path, Ranks()).table["id"].tolist())

@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs import run_files
+from blitzgs.runs import run_files, trained_model
 from blitzgs.training.events import densify
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import EIGHT, all_fail, on_each_device, run_ranks
@@ -42,7 +42,7 @@ def _train(ranks, folder, *overrides):
 
 
 def sorted_table(folder):
-    table = run_files.restore(folder, Ranks()).table
+    table = trained_model.restore(folder, Ranks()).table
     order = table["id"].argsort()
     return {name: table[name][order] for name in table}
 
@@ -150,7 +150,7 @@ def test_a_photograph_lost_on_one_rank_is_named_by_all_and_costs_nothing(tmp_pat
     all_fail(LOST.format("rank 1: .*/photos/0"), _lose_a_photograph, tmp_path)
     # The other rank is in the middle of the step: they save where they next agree. The last checkpoint of the
     # schedule is that after 19 images.
-    assert run_files.restore(tmp_path, Ranks()).progress.step == 16
+    assert trained_model.restore(tmp_path, Ranks()).progress.step == 16
     for summary, _ in run_ranks(_train, 2, tmp_path):
         assert summary["images"] == 60
 
@@ -174,7 +174,7 @@ def _lose_the_last_photographs(ranks, folder):
 
 def test_a_photograph_lost_in_the_last_step_is_named_by_all(tmp_path):
     all_fail(LOST.format("rank 0: /photos/0"), _lose_the_last_photographs, tmp_path)
-    assert run_files.restore(tmp_path, Ranks()).progress.step == 30
+    assert trained_model.restore(tmp_path, Ranks()).progress.step == 30
 
 
 def _lose_a_held_out_photograph(ranks, folder, resume):
@@ -194,7 +194,7 @@ def _lose_a_held_out_photograph(ranks, folder, resume):
 
 def test_a_held_out_photograph_lost_on_several_ranks_is_named_by_all_and_costs_nothing(tmp_path):
     all_fail(LOST.format("/photos/05.png"), _lose_a_held_out_photograph, tmp_path, False)
-    assert run_files.restore(tmp_path, Ranks()).progress.step == 16  # the evaluation is due after 30 images
+    assert trained_model.restore(tmp_path, Ranks()).progress.step == 16  # the evaluation is due at 30
     assert all(run_ranks(_lose_a_held_out_photograph, 2, tmp_path, True))
 
 
@@ -223,7 +223,7 @@ def test_a_signal_within_an_evaluation_does_not_wait_for_its_end(tmp_path, world
     """torchrun ends a process 30 seconds after it was asked to stop; an evaluation may take longer."""
     for compared, summary in run_ranks(_stop_in_an_evaluation, world_size, tmp_path, every):
         assert compared == [step] and summary is None
-    assert run_files.restore(tmp_path, Ranks()).progress.step == step
+    assert trained_model.restore(tmp_path, Ranks()).progress.step == step
     events = [record.get("event") for record in read_log(tmp_path)]
     assert "evaluation stopped" in events and "evaluation" not in events and events[-1] == "stopped"
     assert ("hint" in events) == (world_size > 1)  # a batch of 2 views
@@ -242,7 +242,7 @@ def _resume_with_fewer_views(ranks, folder):
         for later in sorted((folder / run_files.CHECKPOINTS).glob("checkpoint_*"))[1:]:
             shutil.rmtree(later)
     ranks.barrier()
-    known = run_files.restore(folder, ranks).shared["steps"].tolist()
+    known = trained_model.restore(folder, ranks).shared["steps"].tolist()
     del capture.cameras[0], images.images[0]
     capture.train, capture.test = [0, 1, 3, 4, 5, 6], [2]
     config = tiny_config(*SETTINGS, "data.allow_missing=true")
@@ -315,7 +315,7 @@ def assert_same_result(folder, expected):
 def test_sigterm_on_one_rank_saves_and_a_resume_finishes(capture, trained, tmp_path):
     flags = train_flags(capture, tmp_path)
     assert run_ranks(_train_and_stop, 2, flags, 12, join=False) == [0, 0]
-    assert run_files.restore(tmp_path, Ranks()).progress.step == 16  # where the ranks next agree
+    assert trained_model.restore(tmp_path, Ranks()).progress.step == 16  # where the ranks next agree
     assert not (tmp_path / "summary.json").exists()
     # Another number of ranks may continue.
     assert run_ranks(_command, 3, flags, join=False) == [0, 0, 0]
@@ -331,7 +331,7 @@ def test_a_resume_on_as_many_ranks_repeats_every_bit(capture, trained, tmp_path)
     got, want = sorted_table(tmp_path), sorted_table(trained)
     for name in want:
         assert torch.equal(got[name], want[name]), name
-    got, want = (run_files.restore(folder, Ranks()).shared for folder in (tmp_path, trained))
+    got, want = (trained_model.restore(folder, Ranks()).shared for folder in (tmp_path, trained))
     assert len(set(want["views"].tolist())) == 7 and sorted(got) == sorted(want)
     for name in want:
         assert torch.equal(got[name], want[name]), name

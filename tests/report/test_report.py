@@ -13,11 +13,11 @@ import torch
 
 from blitzgs.capture.world import GEO, GEOCENTRIC, WorldFrame
 from blitzgs.cli import main
-from blitzgs.cli.view import kept_warnings
 from blitzgs.report.gather import MAX_POINTS
 from blitzgs.report.report import MAX_BYTES, compare, differences, labels, report
 from blitzgs.runs.evaluation import PARTS, Previews, preview_file
 from blitzgs.runs.folder import open_run
+from blitzgs.util.errors import kept_warnings
 from tests.browser import Browser, needs_chromium, wait_for
 from tests.training.tiny import OVERRIDES, as_flags, at_step, events_of, train, write_tiny_capture
 

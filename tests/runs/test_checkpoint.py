@@ -14,7 +14,7 @@ import torch
 from safetensors.torch import load_file
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs import checkpoint, checkpoint_files, run_files
+from blitzgs.runs import checkpoint, checkpoint_files, trained_model
 from tests.distributed.rank_harness import CONTEXT, all_fail, run_ranks
 from tests.helpers import refused, save_checkpoint
 from tests.training.tiny import random_gaussians, tiny_config
@@ -331,12 +331,12 @@ def test_shared_columns_are_saved_and_checked(tmp_path):
 def test_ranks_that_share_a_memory_need_room_for_all_their_copies(tmp_path, monkeypatch, ranks, copies):
     gaussians, written = random_gaussians(), []
     job = SimpleNamespace(world_size=ranks, watchdog=SimpleNamespace(working=lambda what: nullcontext()))
-    monkeypatch.setattr(run_files, "check_before_saving", lambda *_: None)
-    monkeypatch.setattr(run_files, "available_bytes", lambda: 5 * gaussians.memory_bytes)
+    monkeypatch.setattr(trained_model, "check_before_saving", lambda *_: None)
+    monkeypatch.setattr(trained_model, "available_bytes", lambda: 5 * gaussians.memory_bytes)
     monkeypatch.setattr(
         checkpoint, "Saving", lambda folder, columns, *_: written.append(columns) or SimpleNamespace(wait=int)
     )
-    progress, space = run_files.Progress(1, 0, 1, 1, 0.0), run_files.Space((0.0, 0.0, 0.0), 1.0, 1.0)
-    model = run_files.TrainedModel(tiny_config(), progress, space, gaussians)
-    run_files.save(tmp_path, model, job, in_background=True)
+    progress, space = trained_model.Progress(1, 0, 1, 1, 0.0), trained_model.Space((0.0, 0.0, 0.0), 1.0, 1.0)
+    model = trained_model.TrainedModel(tiny_config(), progress, space, gaussians)
+    trained_model.save(tmp_path, model, job, in_background=True)
     assert (written[0]["means"].data_ptr() != gaussians["means"].data_ptr()) == copies

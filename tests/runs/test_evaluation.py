@@ -24,8 +24,9 @@ from blitzgs.formats.ply import read_ply
 from blitzgs.reference.projection import rotation_matrices, sh_basis
 from blitzgs.runs import checkpoint
 from blitzgs.runs.evaluation import correct_colours, image_metrics, load_lpips
-from blitzgs.runs.export import export, open_source, source_of
+from blitzgs.runs.export import export
 from blitzgs.runs.folder import open_run
+from blitzgs.runs.source import open_source, source_of
 from blitzgs.runs.world import in_world, load_world_frame, rotated_harmonics, save_world_frame
 from tests.helpers import export_ply, refused, save_checkpoint, ssim_map
 
@@ -125,7 +126,7 @@ from blitzgs.formats.models import FORMATS
 from blitzgs.formats.selection import Selected, Selection
 from blitzgs.runs import checkpoint
 from blitzgs.runs.export import export
-from blitzgs.runs.export import open_source
+from blitzgs.runs.source import open_source
 source = open_source(Path(sys.argv[1]))
 chosen = Selected(source, Selection(min_opacity=1e-9, sh_degree=0))
 export(chosen, source.space, FORMATS[sys.argv[2]], Path(sys.argv[3]))

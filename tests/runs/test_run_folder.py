@@ -18,8 +18,9 @@ import blitzgs
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply
-from blitzgs.runs import checkpoint, run_files
+from blitzgs.runs import checkpoint, trained_model
 from blitzgs.runs.export import without_antialiasing
+from blitzgs.runs.resume import check_resumable
 from blitzgs.training.trainer import Trainer
 from tests.helpers import export_ply, refused, save_checkpoint
 from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene
@@ -108,41 +109,31 @@ def test_a_run_and_its_model_print_in_a_line(trained, copy):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "error", "message"),
     [
-        ({"K": np.eye(2)}, r"K must be a finite matrix \(3, 3\)"),
-        ({"K": np.full((3, 3), np.nan)}, r"K must be a finite matrix"),
-        ({"world_to_camera": np.eye(4)[:3]}, r"world_to_camera must be a finite matrix \(4, 4\)"),
-        ({"world_to_camera": 2 * np.eye(4)}, r"\[:3, :3\] must be a rotation"),
+        ({"K": np.eye(2)}, ValueError, r"K must be a finite matrix \(3, 3\)"),
+        ({"K": np.full((3, 3), np.nan)}, ValueError, "K must be a finite matrix"),
+        ({"K": "x"}, TypeError, "K must be a matrix of numbers, got str"),
+        ({"world_to_camera": np.eye(4)[:3]}, ValueError, r"world_to_camera must be a finite matrix \(4, 4\)"),
+        ({"world_to_camera": 2 * np.eye(4)}, ValueError, r"\[:3, :3\] must be a rotation"),
+        ({"world_to_camera": np.diag([1.0, 1, -1, 1])}, ValueError, r"\[:3, :3\] must be a rotation"),
         (
-            {"world_to_camera": np.diag([1.0, 1.0, -1.0, 1.0])},
-            r"world_to_camera\[:3, :3\] must be a rotation",
+            {"world_to_camera": [[1, 2], [3]]},
+            TypeError,
+            "world_to_camera must be a matrix of numbers, got list",
         ),
-        ({"width": 0}, "width must be an integer from 1 to 1,048,576, got 0"),
-        ({"height": 32.5}, "height must be an integer from 1 to 1,048,576, got 32.5"),
+        ({"width": 0}, ValueError, "width must be an integer from 1 to 1,048,576, got 0"),
+        ({"height": 32.5}, ValueError, "height must be an integer from 1 to 1,048,576, got 32.5"),
+        ({"width": "64"}, TypeError, r"width must be an integer, got '64' \(str\)"),
+        ({"height": None}, TypeError, "height must be an integer, got None"),
+        ({"width": True}, TypeError, "width must be an integer, got True"),
     ],
 )
-def test_a_camera_that_cannot_be_rendered_is_refused(trained, change, message):
+def test_a_camera_that_cannot_be_rendered_is_refused(trained, change, error, message):
     model = blitzgs.open_run(trained[1]).model()
     fields = {"K": np.eye(3), "world_to_camera": np.eye(4), "width": 48, "height": 32}
     assert model.camera(**fields).width == 48
-    refused(ValueError, message, model.camera, **fields | change)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"width": "64"}, r"width must be an integer, got '64' \(str\)"),
-        ({"height": None}, "height must be an integer, got None"),
-        ({"width": True}, "width must be an integer, got True"),
-        ({"K": "x"}, "K must be a matrix of numbers, got str"),
-        ({"world_to_camera": [[1, 2], [3]]}, "world_to_camera must be a matrix of numbers, got list"),
-    ],
-)
-def test_a_camera_of_wrong_types_names_the_argument(trained, change, message):
-    model = blitzgs.open_run(trained[1]).model()
-    with pytest.raises(TypeError, match=message):
-        model.camera(**({"K": np.eye(3), "world_to_camera": np.eye(4), "width": 48, "height": 32} | change))
+    refused(error, message, model.camera, **fields | change)
 
 
 def test_a_model_renders_the_cameras_of_its_run_by_index(trained):
@@ -267,9 +258,29 @@ def test_eval_uses_the_configuration_of_the_checkpoint(copy, tmp_path, capsys, c
 
 
 def test_what_a_resume_may_change(trained):
-    saved = run_files.restore(trained[1], Ranks()).config
+    saved = trained_model.restore(trained[1], Ranks()).config
     schedule = dataclasses.replace(saved.schedule, evaluate_every=7, checkpoint_every=9)
-    run_files.check_resumable(saved, dataclasses.replace(saved, schedule=schedule))
+    check_resumable(saved, dataclasses.replace(saved, schedule=schedule))
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--resume", "--loss.ssim=0.3"], "loss.ssim: the checkpoint was trained with 0.2, now 0.3"),
+        (["--extend=1.5", "--loss.ssim=0.3"], "loss.ssim: the checkpoint was trained with 0.2, now 0.3"),
+        (["--resume", "--population.gate=no.json"], "no.json: no such gate; `blitzgs gate fit` makes one"),
+        (["--check", "--population.gate=no.json"], "no.json: no such gate"),
+        # What the capture decides is compared when it is known.
+        (["--resume", "--model.near=0", "--schedule.images_per_view=9", "--loss.opacity_total=1"], "nowhere"),
+    ],
+)
+def test_a_run_is_refused_before_its_capture_is_read(trained, tmp_path, failure, flags, message):
+    assert message in failure("train", "--out", trained[1], "--data", tmp_path / "nowhere", *flags)
+
+
+def test_nothing_is_extended_before_the_capture_is_read(tmp_path, failure):
+    flags = ("--config=defaults", "--extend=1.5", "--data", tmp_path / "nowhere")
+    assert "there is no finished run to extend" in failure("train", "--out", tmp_path / "run", *flags)
 
 
 @pytest.mark.parametrize(
@@ -277,7 +288,7 @@ def test_what_a_resume_may_change(trained):
 )
 def test_a_checkpoint_of_another_version_is_named(trained, tmp_path, failure, state):
     shutil.copy(trained[1] / "config.yaml", tmp_path)
-    table = run_files.restore(trained[1], Ranks()).table
+    table = trained_model.restore(trained[1], Ranks()).table
     save_checkpoint(tmp_path / "checkpoints", {name: table[name] for name in table}, state, Ranks())
     assert "checkpoint_000000 belongs to another version of BlitzGS" in failure("eval", tmp_path)
 
@@ -358,13 +369,6 @@ def test_antialiased_models_are_marked_and_can_be_baked(tmp_path, capsys):
         errors["baked"] += (baked.render(camera) - wanted).square().mean().item()
     gain = 10 * math.log10(errors["marked"] / errors["baked"])
     assert gain > 3, errors
-
-
-def test_export_refuses_a_name_that_promises_another_format(trained, tmp_path, capsys):
-    path = tmp_path / "model.spz"
-    assert main(["export", str(trained[1]), "--ply", str(path)]) == 1
-    assert "model.spz: the file will be PLY: choose a name that ends in .ply" in capsys.readouterr().err
-    assert not path.exists()
 
 
 # Paths may have any characters.

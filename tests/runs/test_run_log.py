@@ -14,9 +14,11 @@ import torch
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import log as run_log
-from blitzgs.runs.folder_checks import FolderError, check_room, check_writable, known_id, locked
+from blitzgs.runs.folder_checks import FolderError, check_room, check_writable, locked
 from blitzgs.runs.guard import LossGuard, NonFiniteError
-from blitzgs.runs.log import LOG, RunLog
+from blitzgs.runs.log import RunLog
+from blitzgs.runs.run_files import LOG
+from blitzgs.runs.trained_model import known_id
 from blitzgs.training.trainer import Trainer
 from blitzgs.util import progress
 from tests.distributed.rank_harness import all_fail
@@ -39,9 +41,8 @@ def work_on(folder, monkeypatch, terminal):
     with log.work("views measured") as report:
         for done in (1, 2):
             report(done, 2)
-        bars = (
-            [] if log._progress is None else [(bar.description, bar.completed) for bar in log._progress.tasks]
-        )
+        shown = [] if log._progress is None else log._progress.tasks
+        bars = [(bar.description, bar.completed) for bar in shown]
     log.close()
     return position, bars
 
@@ -113,26 +114,12 @@ def test_what_is_shown_is_a_running_mean_and_the_held_out_figure(tmp_path, monke
     assert "loss 0.4000  train 25.00 dB" in lines[1]
     assert "loss 0.1000  train 24.00 dB  held-out 22.50 dB" in lines[-2]
     assert "bad \\x1b[2J name" in lines[-1]
-    assert [record["psnr"] for record in records(tmp_path)[:2]] == [
-        20.0,
-        30.0,
-    ]  # the file has each view's own
-
-
-class Broken:
-    """A frame that names CUDA as its device, so that the guard reads sums a step later, as on CUDA."""
-
-    def __init__(self, frame, device="cpu"):
-        self._frame, self._device = frame, device
-
-    def __getattr__(self, name):
-        found = getattr(self._frame, name)
-        if name == "renders" and self._device == "cuda":
-            return OnCuda(found)
-        return found
+    assert [record["psnr"] for record in records(tmp_path)[:2]] == [20.0, 30.0]  # each view's own
 
 
 class OnCuda:
+    """Images that name CUDA as their device, so that the guard reads sums a step later, as on CUDA."""
+
     device = torch.device("cuda")
 
     def __init__(self, tensor):
@@ -189,7 +176,7 @@ def test_the_guard_names_the_pixel_and_says_what_it_has_looked_at(frame):
     ):
         LossGuard().check(9, ("a", "b"), bad, table, rendered)
     # A step later, the message does not name data that no longer exist.
-    guard, late = LossGuard(), Broken(rendered, "cuda")
+    guard, late = LossGuard(), rendered._replace(renders=OnCuda(rendered.renders))
     guard.check(9, ("a", "b"), bad, table, late)
     with pytest.raises(NonFiniteError) as failure:
         guard.check(10, ("c", "d"), Sums(0, 0, 0, 0), table, late)
@@ -198,7 +185,7 @@ def test_the_guard_names_the_pixel_and_says_what_it_has_looked_at(frame):
     assert "in step 10 the parameters are finite" in text and "view 'c', 'd'" in text
     guard.check(9, ("a", "b"), bad, table, late)
     splats = rendered.projected._replace(depths=rendered.projected.depths * torch.inf)
-    spoiled = Broken(rendered._replace(projected=splats), "cuda")
+    spoiled = late._replace(projected=splats)
     with pytest.raises(NonFiniteError, match="found in step 10: .* op project, output depths"):
         guard.check(10, ("c", "d"), Sums(0, 0, 0, 0), table, spoiled)
 

@@ -27,7 +27,7 @@ import torch
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.render import RenderOptions, render_frame
 from blitzgs.ops.projection_types import WeightedViews
-from blitzgs.runs import run_files
+from blitzgs.runs import trained_model
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.views import Space, ViewSet
@@ -92,7 +92,7 @@ def finish(data, out):
     process = start(data, out, "--resume")
     process.join(240)
     assert process.exitcode == 0
-    return run_files.restore(out, Ranks()).table
+    return trained_model.restore(out, Ranks()).table
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def scene(tmp_path_factory):
     begin = time.monotonic()
     process.join(240)
     assert process.exitcode == 0
-    return data, run_files.restore(out, Ranks()).table, time.monotonic() - begin
+    return data, trained_model.restore(out, Ranks()).table, time.monotonic() - begin
 
 
 def kill(process, data, out):

@@ -19,7 +19,7 @@ from blitzgs.config.files import ConfigError, load_config
 from blitzgs.config.ranges import problems
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs import run_files
+from blitzgs.runs import run_files, trained_model
 from blitzgs.training.budget import Budget, extended
 from blitzgs.training.replay import replay
 from blitzgs.training.trainer import Trainer
@@ -196,7 +196,7 @@ def test_a_run_resumes_before_and_after_it_has_chosen_its_pace(tmp_path, stop):
     assert bool(before) == (stop > 8)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert run_files.open_model(tmp_path, Ranks()).config.schedule.pace == before
+        assert trained_model.open_model(tmp_path, Ranks()).config.schedule.pace == before
     second = start(tmp_path, resume=True)
     # The time that the checkpoint was trained counts, also if the command changes the budget.
     assert second.state.config.schedule.pace == before

@@ -19,7 +19,7 @@ from blitzgs.capture.capture import load_capture
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply
-from blitzgs.runs import run_files
+from blitzgs.runs import trained_model
 from blitzgs.training.sampler import tour_of
 from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, Camera, as_flags, events_of, write_tiny_capture
 
@@ -80,7 +80,7 @@ def test_export_restores_the_units_of_the_capture(trained, tmp_path, capsys):
     path = tmp_path / "model.ply"
     assert main(["export", str(trained[1]), "--ply", str(path), "--classic"]) == 0
     assert "--classic changes nothing: the model was trained without" in capsys.readouterr().err
-    model, exported = run_files.open_model(trained[1], Ranks()), read_ply(path)
+    model, exported = trained_model.open_model(trained[1], Ranks()), read_ply(path)
     means = model.table["means"].double() * model.space.unit + torch.tensor(model.space.offset)
     torch.testing.assert_close(exported.means.double(), means, rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(exported.scales, model.table["scales"] + math.log(model.space.unit))
@@ -120,6 +120,7 @@ def test_torchrun_entry(trained, tmp_path):
         (["eval", "x", "--pictures", "1", "--pictures=2"], 2, "--pictures is given twice"),
         (["train", "--out", "x", "--out=y"], 2, "--out is given twice"),
         (["train", "--out", "x", "--extend=2", "--minutes=3"], 2, "--extend and --minutes exclude"),
+        (["train", "--check", "--resume"], 2, "required: --data, --out"),
         (["train", "--out", "x", "--seed=1", "--seed=2"], 2, "--seed is given twice"),
         (["train", "--out", "x", "--log.every", "1", "--log.every=1"], 2, "--log.every is given twice"),
         (

@@ -18,7 +18,7 @@ from blitzgs.capture.images import PhotographError
 from blitzgs.config.files import ConfigError
 from blitzgs.distributed.group import Ranks
 from blitzgs.population.importance import PHI, is_culled
-from blitzgs.runs import run_files
+from blitzgs.runs import run_files, trained_model
 from blitzgs.runs.guard import ModelLostError
 from blitzgs.spawn.candidates import FEATURES
 from blitzgs.spawn.fit import fit, read_spawns
@@ -135,7 +135,7 @@ def test_resume_is_exact_and_carries_the_columns(whole_run, tmp_path, monkeypatc
     second, _ = train(tmp_path, resume=True)
     assert_same_table(second.state.table, whole.state.table)
     assert second.state.progress.milestones == whole.state.progress.milestones
-    model = run_files.open_model(tmp_path, Ranks())
+    model = trained_model.open_model(tmp_path, Ranks())
     assert torch.equal(model.table[PHI], whole.state.table[PHI])
 
 
@@ -422,4 +422,4 @@ def test_a_pass_that_a_signal_cuts_short_happens_after_the_resume(tmp_path, monk
 )
 def test_a_pass_that_keeps_nothing_ends_the_run_before_it_is_saved(tmp_path, options, named):
     refused(ModelLostError, named, train, tmp_path, *options, "schedule.checkpoint_every=10")
-    assert len(run_files.open_model(tmp_path, Ranks()).table) > 0
+    assert len(trained_model.open_model(tmp_path, Ranks()).table) > 0

@@ -18,7 +18,7 @@ import torch
 
 from blitzgs.capture.images import PhotographError
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs import checkpoint, run_files
+from blitzgs.runs import checkpoint, trained_model
 from blitzgs.runs.folder import open_run
 from blitzgs.runs.guard import NonFiniteError
 from blitzgs.spawn.lineage_parts import read_lineage
@@ -53,7 +53,7 @@ def test_what_is_not_finite_is_not_saved(tmp_path, monkeypatch, column):
     message = rf"step 40: rank 0: column '{column}' is not finite in 1 Gaussians \(ids \d+\).*earlier ones"
     refused(NonFiniteError, message, running.train)
     assert checkpoints(tmp_path) == ["checkpoint_000000", "checkpoint_000001"]
-    assert run_files.restore(tmp_path, Ranks()).progress.step == 27
+    assert trained_model.restore(tmp_path, Ranks()).progress.step == 27
 
 
 def test_a_checkpoint_with_nan_is_not_resumed_from(tmp_path):
@@ -64,7 +64,7 @@ def test_a_checkpoint_with_nan_is_not_resumed_from(tmp_path):
     newest = checkpoint.load(max((tmp_path / "checkpoints").iterdir()), Ranks(), "cpu")
     save_checkpoint(tmp_path / "checkpoints", table.columns, newest.state, Ranks())
     with pytest.warns(UserWarning, match="is refused: column 'sh' is not finite.*; using checkpoint_000001"):
-        found = run_files.restore(tmp_path, Ranks())
+        found = trained_model.restore(tmp_path, Ranks())
     assert found.source == "checkpoint_000001 (the newest sound one; 1 newer refused)"
 
 
@@ -88,7 +88,7 @@ def test_a_checkpoint_is_written_by_the_clock_by_default(tmp_path, monkeypatch):
 def test_training_goes_on_while_a_checkpoint_is_written(tmp_path, monkeypatch, room):
     """The checkpoint has the model of the step at which it began; without room for a copy, training waits."""
     saved, may_write, then = {}, threading.Event(), []
-    save, write = run_files.save, checkpoint.write_shard
+    save, write = trained_model.save, checkpoint.write_shard
 
     def noted(folder, model, *others):
         saved.setdefault("columns", {name: model.table[name].clone() for name in model.table})
@@ -102,8 +102,8 @@ def test_training_goes_on_while_a_checkpoint_is_written(tmp_path, monkeypatch, r
         assert checkpoints(tmp_path) == ([] if room else ["checkpoint_000000"])
         may_write.set()
 
-    monkeypatch.setattr(run_files, "available_bytes", lambda: room)
-    monkeypatch.setattr(run_files, "save", noted)
+    monkeypatch.setattr(trained_model, "available_bytes", lambda: room)
+    monkeypatch.setattr(trained_model, "save", noted)
     monkeypatch.setattr(checkpoint, "write_shard", write_late)
     at_step(monkeypatch, 33, lambda self: self.state.save_clock.restart(0))
     at_step(monkeypatch, 36, go_on)
@@ -119,7 +119,7 @@ def test_every_signal_saves(tmp_path, monkeypatch, number):
     at_step(monkeypatch, 17, lambda self: os.kill(os.getpid(), number))
     running = trainer(tmp_path)
     assert running.train() is None
-    assert run_files.restore(tmp_path, Ranks()).progress.step == 17
+    assert trained_model.restore(tmp_path, Ranks()).progress.step == 17
     assert signal.Signals(number).name in read_log(tmp_path)[-1]["reason"]
 
 
@@ -255,7 +255,7 @@ def test_a_photograph_that_vanishes_costs_nothing(tmp_path, monkeypatch):
     at_step(monkeypatch, 40, lambda self: setattr(images, "get", gone))
     running = trainer(tmp_path / "cut", images=images)
     refused(PhotographError, r"/photos/0\d.png'.*put the photograph back.*--resume", running.train)
-    saved = run_files.restore(tmp_path / "cut", Ranks()).progress.step
+    saved = trained_model.restore(tmp_path / "cut", Ranks()).progress.step
     assert 40 <= saved <= 44  # some batches were loaded ahead
     images.get = get
     monkeypatch.undo()
@@ -276,7 +276,7 @@ def test_a_held_out_photograph_that_vanishes_costs_nothing(tmp_path):
     images.get = held_out_is_gone
     running = trainer(tmp_path, "schedule.evaluate_every=30", images=images)
     refused(PhotographError, r"/photos/03.png.*put the photograph back.*--resume", running.train)
-    assert run_files.restore(tmp_path, Ranks()).progress.step == 31
+    assert trained_model.restore(tmp_path, Ranks()).progress.step == 31
     images.get = get
     assert trainer(tmp_path, "schedule.evaluate_every=30", resume=True).train() is not None
 
@@ -312,7 +312,7 @@ def test_the_last_checkpoint_waits_for_room(tmp_path, monkeypatch, capsys):
     assert trainer(tmp_path).train() is not None
     shown = capsys.readouterr().out
     assert shown.count("The model is still in memory: free some space") == 2
-    assert run_files.restore(tmp_path, Ranks()).progress.step == 100
+    assert trained_model.restore(tmp_path, Ranks()).progress.step == 100
 
 
 def test_waiting_for_room_ends_when_asked(tmp_path, monkeypatch):
@@ -344,7 +344,7 @@ def test_another_error_than_lack_of_space_saves_elsewhere_at_once(tmp_path, monk
     assert (f"The model is saved in {saved}: continue with --resume --out" in message) == elsewhere
     assert ("it is lost" in message) != elsewhere
     if elsewhere:
-        assert run_files.restore(saved, Ranks()).progress.step == 100
+        assert trained_model.restore(saved, Ranks()).progress.step == 100
         assert open_run(saved).cameras().test == [3] and len(open_run(saved).model()) > 0
 
 

@@ -6,9 +6,8 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.runs import run_files
+from blitzgs.runs import run_files, trained_model
 from blitzgs.runs.evaluation import render_view
-from blitzgs.runs.run_files import model_gate
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.pool import Pool, PoolError
 from blitzgs.table.table import GaussianTable
@@ -165,9 +164,9 @@ def test_a_model_with_a_cull_mask_is_rendered_through_a_pool(tmp_path, monkeypat
     trainer, _ = train(tmp_path, RESIDENT, "schedule.iterations=30", "view.lod=true",
                        "schedule.densify_until=10", "population.importance=true", "population.pass1_keep=1",
                        "schedule.t1=12", "schedule.t2=0", "view.cull=true")  # fmt: skip
-    model, ranks = run_files.open_model(tmp_path, Ranks()), Ranks()
+    model, ranks = trained_model.open_model(tmp_path, Ranks()), Ranks()
     table = model.table
-    lod = model_gate(model.config, model.progress, table, ranks)
+    lod = model.progress.model_gate(model.config, table, ranks)
     options, owners = trainer.state.render_options, TileOwners(ranks)
     resident, views = VisibleFinder(table, lod), trainer.state.views
     expected = [render_view(resident, views, i, options, owners) for i in (0, 5)]
@@ -187,9 +186,9 @@ def test_rows_are_sorted_for_a_pool_or_for_another_number_of_ranks(tmp_path):
     """Density events sort the rows rarely, and those of each rank alone."""
     train(tmp_path / "one", "schedule.iterations=20")
     run_ranks(_train, 2, tmp_path / "two", ("schedule.iterations=20",))
-    restored = run_files.restore(tmp_path / "two", Ranks())
+    restored = trained_model.restore(tmp_path / "two", Ranks())
     assert restored.progress.sorted_spread == 0
-    model = run_files.open_model(tmp_path / "one", Ranks(), resident_gb=0.1)
+    model = trained_model.open_model(tmp_path / "one", Ranks(), resident_gb=0.1)
     pool = model.subject(Ranks()).gaussians
     config = tiny_config(*SETTINGS, "schedule.iterations=20", RESIDENT)
     resumed = Trainer(config, *street(), tmp_path / "one", Ranks(), resume=True)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from blitzgs.config.files import ConfigError, to_dict
+from blitzgs.config.files import ConfigError, load_config, to_dict
 from blitzgs.distributed.group import Ranks
-from blitzgs.runs import run_files
+from blitzgs.runs import run_files, trained_model
 from blitzgs.runs.guard import NonFiniteError
 from blitzgs.training.events import densify
 from blitzgs.training.trainer import Trainer
@@ -57,11 +57,11 @@ def test_what_a_run_leaves_behind(whole_run):
     assert summary["peak_gaussians"] >= summary["gaussians"]
     assert [r["t"] for r in steps_of(folder)] == [20, 40, 60, 80, 100]
     assert [r["t"] for r in events_of(folder, "densify")] == [20, 40, 60, 80]
-    assert run_files.load_config(folder / "config.yaml") == trainer.state.config
+    assert load_config(folder / "config.yaml") == trainer.state.config
     metrics = json.loads((folder / "evaluation" / "000100" / "metrics.json").read_text())
     assert list(metrics["views"]) == ["03.png"]
     assert (folder / "evaluation" / "000100" / "03.jpg").stat().st_size > 0
-    model = run_files.open_model(folder, Ranks())
+    model = trained_model.open_model(folder, Ranks())
     assert_same_table(model.table, trainer.state.table)
 
 
@@ -79,7 +79,7 @@ def test_resume_is_exact(whole_run, tmp_path, monkeypatch):
     The first 50 are those of an earlier version, whose configuration has fields that are gone.
     """
     _, whole, _ = whole_run
-    for module in ("blitzgs.config.files", "blitzgs.runs.run_files"):
+    for module in ("blitzgs.config.files", "blitzgs.runs.trained_model"):
         monkeypatch.setattr(f"{module}.to_dict", _of_an_earlier_version)
     stop_at(monkeypatch, 50)
     first, summary = train(tmp_path)
@@ -87,7 +87,7 @@ def test_resume_is_exact(whole_run, tmp_path, monkeypatch):
     monkeypatch.undo()
     written = tmp_path / "config.yaml"
     assert "max_imbalance: 1.3" in written.read_text()
-    assert run_files.load_config(written) == first.state.config
+    assert load_config(written) == first.state.config
     second, summary = train(tmp_path, resume=True)
     assert summary is not None
     assert_same_table(second.state.table, whole.state.table)
@@ -108,7 +108,7 @@ def test_a_run_is_resumed_with_either_configuration(tmp_path, monkeypatch, asked
     views = len(first.state.capture.train)
     assert summary is None
     monkeypatch.undo()
-    own = run_files.load_config(tmp_path / "config.yaml")
+    own = load_config(tmp_path / "config.yaml")
     if field == "schedule.scale":
         assert first.state.schedule.iterations == 20 * views > 50
         assert own.schedule.images_per_view == 0 and own.schedule.scale == views / 2

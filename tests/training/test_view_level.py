@@ -16,9 +16,8 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply, write_ply
 from blitzgs.frame.render import render_frame
 from blitzgs.population.importance import is_culled
-from blitzgs.runs import run_files
+from blitzgs.runs import trained_model
 from blitzgs.runs.evaluation import image_metrics
-from blitzgs.runs.run_files import lod_gate, model_gate
 from blitzgs.table.table import CULL, GaussianTable
 from blitzgs.training import view_level
 from blitzgs.training.events import evaluate
@@ -117,11 +116,11 @@ def test_what_the_run_says_and_saves(whole_run):
     assert len(progress.gated_views) == 7 and "1" in progress.gated_views
     assert again["gated_views"] == progress.gated_views.count("1") and again["kept"] < 0.95
     assert events_of(folder, "clear_cull")[0]["t"] == 85 and CULL not in trainer.state.table
-    saved = run_files.open_model(folder, Ranks())
+    saved = trained_model.open_model(folder, Ranks())
     # What comes after the checkpoint takes time, too.
     assert saved.progress == dataclasses.replace(progress, stages=saved.progress.stages)
-    gate = model_gate(saved.config, saved.progress, saved.table, Ranks())
-    assert gate.gate == model_gate(trainer.state.config, progress, trainer.state.table, Ranks()).gate
+    gate = saved.progress.model_gate(saved.config, saved.table, Ranks())
+    assert gate.gate == progress.model_gate(trainer.state.config, trainer.state.table, Ranks()).gate
 
 
 def test_evaluation_has_the_gate_and_no_mask(tmp_path, monkeypatch):
@@ -133,7 +132,7 @@ def test_evaluation_has_the_gate_and_no_mask(tmp_path, monkeypatch):
     found = evaluate.measure(state, [3], None)
     view, camera = state.views.pick([3]), state.capture.cameras[3]
     distances = torch.cdist(state.table["means"].double(), centres_of(view.viewmats))[:, 0]
-    gate = model_gate(state.config, state.progress, state.table, Ranks()).gate
+    gate = state.progress.model_gate(state.config, state.table, Ranks()).gate
     reach = torch.tensor(gate.reach(), dtype=torch.float64)[state.table["level"].long()]
     assert (distances <= reach).double().mean() < 0.95
     small = GaussianTable({name: state.table[name] for name in state.table})
@@ -171,7 +170,7 @@ def test_levels_that_follow_footprints_leave_out_what_is_small_in_the_view(tmp_p
         followed.append((state.images_seen, not torch.equal(table["level"], before)))
 
     def model_gate_of(state):
-        return lod_gate(state.config, dataclasses.replace(state.progress, finest_level=31, gated_views=""))
+        return dataclasses.replace(state.progress, finest_level=31, gated_views="").lod_gate(state.config)
 
     monkeypatch.setattr(view_level, "follow_footprints", watched)
     flags = (
@@ -216,7 +215,7 @@ def test_render_honours_the_gate(tmp_path):
 
 def test_a_gate_that_no_training_view_has_is_not_applied_elsewhere(tmp_path, monkeypatch):
     """Coarse levels that no training view shows alone are not shown alone by any other view."""
-    monkeypatch.setattr("blitzgs.runs.run_files.MOST_KEPT", 0.0)
+    monkeypatch.setattr("blitzgs.runs.trained_model.MOST_KEPT", 0.0)
     trainer, _ = train(tmp_path)
     progress = trainer.state.progress
     assert progress.finest_level is not None and set(progress.gated_views) == {"0"}
@@ -296,7 +295,7 @@ def test_a_run_with_smooth_levels_is_shown_as_it_was_trained(tmp_path):
     state = trainer.state
     assert_same_table(resumed.state.table, state.table)
     assert set(state.progress.gated_views) == {"1"}  # for any share that the views keep
-    gate = model_gate(state.config, state.progress, state.table, Ranks())
+    gate = state.progress.model_gate(state.config, state.table, Ranks())
     view, camera = state.views.pick([3]), state.capture.cameras[3]
     weights = gate.gate.weights(state.table["means"], state.table["level"], centres_of(view.viewmats)[0])
     assert ((weights > 0) & (weights < 1)).sum() > 10

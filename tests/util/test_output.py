@@ -102,18 +102,15 @@ def test_a_link_that_appears_later_is_not_followed(tmp_path):
 
 @pytest.mark.parametrize("kind", ["link", "dangling link", "folder", "pipe", "device"])
 def test_only_regular_files_are_replaced(tmp_path, kind):
-    path = tmp_path / "file"
+    path = Path("/dev/null") if kind == "device" else tmp_path / "file"
     if kind == "link":
         (tmp_path / "target").write_text("old")
-        path.symlink_to(tmp_path / "target")
-    elif kind == "dangling link":
+    if kind.endswith("link"):
         path.symlink_to(tmp_path / "target")
     elif kind == "folder":
         path.mkdir()
     elif kind == "pipe":
         os.mkfifo(path)
-    else:
-        path = Path("/dev/null")
     before = path.lstat()
     refused(OSError, "which is not overwritten", write_file, path, b"new")
     assert path.lstat().st_ino == before.st_ino and path.lstat().st_mode == before.st_mode
@@ -151,28 +148,18 @@ NAMESPACE = "{http://www.w3.org/2000/svg}"
 @pytest.mark.parametrize(
     ("points", "most", "columns", "rows"),
     [
-        (
-            [(0, 1547), (750, 10411)],
-            None,
-            ["0", "200", "400", "600"],
-            ["0", "2.5k", "5k", "7.5k", "10k", "12.5k"],
-        ),
-        (
-            [(0, 3), (30_000, 1e6)],
-            None,
-            ["0", "10k", "20k", "30k"],
-            ["0", "200k", "400k", "600k", "800k", "1M"],
-        ),
-        ([(5, 0.5)], 1.0, ["0", "1", "2", "3", "4", "5"], ["0", "0.2", "0.4", "0.6", "0.8", "1"]),
-        ([(0, 0)], None, ["0", "0.2", "0.4", "0.6", "0.8", "1"], ["0", "0.2", "0.4", "0.6", "0.8", "1"]),
+        ([(0, 1547), (750, 10411)], None, "0 200 400 600", "0 2.5k 5k 7.5k 10k 12.5k"),
+        ([(0, 3), (30_000, 1e6)], None, "0 10k 20k 30k", "0 200k 400k 600k 800k 1M"),
+        ([(5, 0.5)], 1.0, "0 1 2 3 4 5", "0 0.2 0.4 0.6 0.8 1"),
+        ([(0, 0)], None, "0 0.2 0.4 0.6 0.8 1", "0 0.2 0.4 0.6 0.8 1"),
     ],
 )
 def test_axes_have_round_numbers(points, most, columns, rows):
     chart = ElementTree.fromstring(line_chart({"": points}, "images", "Gaussians", most))
     labels = list(chart.iter(f"{NAMESPACE}text"))
-    assert [label.text for label in labels if label.get("text-anchor") == "middle"] == columns
+    assert [label.text for label in labels if label.get("text-anchor") == "middle"] == columns.split()
     below = [label for label in labels if label.get("text-anchor") == "end" and label.text != "images"]
-    assert [label.text for label in below] == rows
+    assert [label.text for label in below] == rows.split()
 
 
 def test_a_label_is_below_its_point():

@@ -12,10 +12,10 @@ from pathlib import Path
 
 from blitzgs.config.files import save_config
 from blitzgs.config.schedule import Event
-from blitzgs.runs import run_files
+from blitzgs.runs import run_files, trained_model
 from blitzgs.runs.cameras import save_cameras
 from blitzgs.runs.checkpoint import CheckpointError, Saving
-from blitzgs.runs.run_files import TrainedModel
+from blitzgs.runs.trained_model import TrainedModel
 from blitzgs.training.state import TrainingState
 from blitzgs.util.output import is_lack_of_space
 
@@ -127,7 +127,7 @@ def _save(state: TrainingState, folder: Path, in_background: bool = False) -> Sa
         shared |= state.stepper.exposures.columns()
     shared = {name: column.clone() for name, column in shared.items()}
     model = TrainedModel(state.config, state.progress, state.space, state.table, state.run_id, shared=shared)
-    return run_files.save(folder, model, state.ranks, in_background)
+    return trained_model.save(folder, model, state.ranks, in_background)
 
 
 def _report(state: TrainingState, error: CheckpointError, what_next: str) -> None:
