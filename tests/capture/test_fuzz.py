@@ -2,13 +2,11 @@
 """Damaged files give a ValueError or a model of the size of the file: no crash, no wild allocation."""
 
 import json
-import os
+import multiprocessing
 import resource
 import struct
-import subprocess
-import sys
 import tempfile
-import traceback
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -22,7 +20,7 @@ from blitzgs.capture.image_files import decode_rgb, read_header, read_whole
 from blitzgs.capture.transforms import read_transforms
 from blitzgs.formats import native
 from blitzgs.formats.ply import read_ply, read_point_cloud
-from tests.capture.helpers import ROOT, reconstruction, smooth_image, tiff, write_image
+from tests.capture.helpers import reconstruction, smooth_image, tiff, write_image
 from tests.formats.test_ply import gaussians, inria_file
 from tests.helpers import refused
 
@@ -101,39 +99,17 @@ LITTLE = 24
 BLOCKS = 128
 
 
-def serve() -> None:
-    """Call functions of this file on paths, [name, path] in each line, in a fork of this process each."""
-    for line in sys.stdin:
-        name, path = json.loads(line)
-        reads, writes = os.pipe()
-        if os.fork() == 0:
-            try:
-                found = {"result": globals()[name](path)}
-            except BaseException:  # noqa: BLE001 - reported to the test
-                found = {"error": traceback.format_exc()}
-            os.write(writes, json.dumps(found).encode())
-            os._exit(0)
-        os.close(writes)
-        with open(reads) as pipe:
-            found = pipe.read()
-        _, status = os.wait()
-        print(found or json.dumps({"error": f"the process ended with status {status}"}), flush=True)
-
-
 @pytest.fixture(scope="module")
 def in_fresh_process():
     """Call a function of this file on a path in a process of its own, which has no freed memory."""
-    command = [sys.executable, "-c", "from tests.capture import test_fuzz; test_fuzz.serve()"]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    with subprocess.Popen(command, **pipes, text=True, cwd=ROOT) as server:
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
 
-        def call(function, path: Path):
-            print(json.dumps([function.__name__, str(path)]), file=server.stdin, flush=True)
-            found = json.loads(server.stdout.readline())
-            assert "error" not in found, found["error"]
-            return found["result"]
+    def call(function, path: Path):
+        with ProcessPoolExecutor(1, context) as pool:
+            return pool.submit(function, str(path)).result()
 
-        yield call
+    return call
 
 
 def limit_memory(mebibytes: int) -> None:
