@@ -27,13 +27,13 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.population.redistribution import global_positions
 from blitzgs.runs.checkpoint_files import DAMAGE, Manifest, Shard, finish, opened, verified, write_shard
 from blitzgs.util.errors import UserError, warn
+from blitzgs.util.output import is_lack_of_space
 
 T = TypeVar("T")
 
 SHARED = "shared.safetensors"
 _NAME = re.compile(r"checkpoint_(\d{6,})")
 _UNFINISHED = ".unfinished_"
-_LACK_OF_SPACE = (errno.ENOSPC, errno.EDQUOT)
 
 
 class CheckpointError(UserError):
@@ -136,7 +136,7 @@ class Saving:
                 mine, common = self._written.result()
         except OSError as error:
             problem = f"rank {ranks.rank} could not write: {_explain(error)}"
-            lacks_space = error.errno in _LACK_OF_SPACE
+            lacks_space = is_lack_of_space(error)
         results = ranks.all_gather_object((mine, problem, lacks_space))
         problems = [text for _, text, _ in results if text]
         lacks_space = all(lacks for _, _, lacks in results)
@@ -147,7 +147,7 @@ class Saving:
                     finish(self._folder, path, Manifest(shards, common, self._state))
             except OSError as error:
                 problems.append(f"rank 0 could not write: {_explain(error)}")
-                lacks_space = error.errno in _LACK_OF_SPACE
+                lacks_space = is_lack_of_space(error)
         problems, lacks_space = ranks.broadcast_object((problems, lacks_space))
         if problems:
             if ranks.rank == 0:
@@ -260,7 +260,7 @@ def read_share(path: Path, shards: list[Shard], ranks: Ranks, device: torch.devi
 
 def _explain(error: OSError) -> str:
     """Return why a file was not written, and what to do where that is known."""
-    if error.errno in _LACK_OF_SPACE:
+    if is_lack_of_space(error):
         return f"the disk is full ({error}); free some space or lower the number of checkpoints kept"
     if error.errno == errno.EFBIG:
         return f"a file is larger than is allowed ({error}); raise the limit (ulimit -f) or use another disk"

@@ -7,6 +7,7 @@ equal when their suffix is replaced. `OutputFolder` makes paths of them for whic
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import hashlib
 import os
@@ -217,6 +218,11 @@ def check_outside(path: Path, inputs: Path) -> None:
     """Check that new files in `path` would not lie in a folder of inputs (else ValueError)."""
     if path.resolve().is_relative_to(inputs.resolve()):
         raise ValueError(f"{path} is in {inputs}, whose files are read: choose a folder outside it")
+
+
+def is_lack_of_space(error: OSError) -> bool:
+    """Tell whether an error would not have happened with more space on the disk."""
+    return error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
 @contextmanager
