@@ -10,7 +10,7 @@ import shlex
 import sys
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from blitzgs.capture.colmap import find_models
 from blitzgs.cli.arguments import Commands, add_command, add_device, add_flags, number
 from blitzgs.cli.sfm import understood_alone, with_poses
 from blitzgs.cli.view import kept_warnings, write_final_report
-from blitzgs.config.fields import Config, Transport
+from blitzgs.config.fields import Config
 from blitzgs.config.files import ConfigError, changed, default_recipe, load_config, recipe_path, to_dict
 from blitzgs.config.ranges import describe, describe_all, describe_page
 from blitzgs.distributed.group import Ranks
@@ -186,7 +186,7 @@ def run(args: argparse.Namespace) -> int:
         Ranks.from_environment(
             args.device,
             job.timeout_seconds,
-            cast(Transport, job.transport),
+            job.transport,
             args.share_gpus,
             tables_on_host=config.memory.resident_gb > 0,
             lap=laps.lap,

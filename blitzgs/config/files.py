@@ -265,6 +265,10 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return _build(typing.cast(type, hint), value, path)
     origin, options = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Literal:
+        if value not in options:
+            raise ConfigError(f"{path}: must be one of {', '.join(options)}, got {value}")
+        return value
     if origin in (types.UnionType, typing.Union):
         if value is None or (isinstance(value, bool) and bool in options):
             return value

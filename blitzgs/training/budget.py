@@ -13,9 +13,9 @@ import math
 from dataclasses import dataclass, replace
 
 from blitzgs.capture.capture import Capture
-from blitzgs.config.fields import Config, ScheduleConfig
+from blitzgs.config.fields import SCALE, Config, ScheduleConfig
 from blitzgs.config.files import ConfigError
-from blitzgs.config.ranges import MAX_IMAGES, SCALE, problems
+from blitzgs.config.ranges import MAX_IMAGES, problems
 from blitzgs.config.schedule import Schedule, stretched
 from blitzgs.population.growth import growth_limit
 from blitzgs.training.state import TrainingState

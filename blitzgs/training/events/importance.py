@@ -5,12 +5,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import cast
 
 import torch
 from torch import Tensor
 
-from blitzgs.config.fields import ScoreRule
 from blitzgs.config.schedule import Event
 from blitzgs.population.importance import Importance, ViewBatch, sample_by_score, sweep, top_by_score
 from blitzgs.population.redistribution import redistribute
@@ -46,7 +44,7 @@ def run_importance_pass(state: TrainingState, event: Event) -> None:
             subject.options,
             state.ranks,
             state.owners,
-            cast(ScoreRule, state.config.population.score),
+            state.config.population.score,
             subject.lod,
             state.stops,
         )
