@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Hashable, Sequence
 from functools import lru_cache
 
@@ -87,13 +88,7 @@ class BatchSampler:
 
     def _round_of(self, step: int) -> int:
         """Find the last round that starts at or before `step` and is not empty."""
-        low, high = 0, 1
-        while self._batches_before(high) <= step:
-            low, high = high, 2 * high
-        while high - low > 1:
-            middle = (low + high) // 2
-            low, high = (middle, high) if self._batches_before(middle) <= step else (low, middle)
-        return low
+        return bisect_right(range(1 << 60), step, key=self._batches_before) - 1
 
     def _make_round(self, index: int) -> list[tuple[int, int]]:
         """List the batches of a round in their order: group, and number within the group."""
