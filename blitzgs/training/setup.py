@@ -44,7 +44,7 @@ from blitzgs.training.records import PICTURE
 from blitzgs.training.sampler import BatchSampler, tour_of
 from blitzgs.training.state import Curve, TrainingState
 from blitzgs.training.step import Stepper
-from blitzgs.training.view_level import keep_to_views
+from blitzgs.training.view_level import forget_views
 from blitzgs.view.levels import measure_levels
 from blitzgs.view.views import Space, ViewSet, trained_centres
 
@@ -85,7 +85,11 @@ def set_up(
     lap("checks")
     home = torch.device("cpu") if config.memory.resident_gb > 0 else ranks.device
     restored = run_files.restore(folder, ranks, home) if resume else None
-    config = _continued(_resolved(config, capture, restored), restored, extend, folder)
+    # Photographs may be lost or found again after a checkpoint (`data.allow_missing`). What it has by the
+    # index of a training view would then belong to other views.
+    train_views = train_views_fingerprint(capture)
+    same_views = restored is None or restored.progress.train_views in ("", train_views)
+    config = _continued(_resolved(config, capture, restored, same_views), restored, extend, folder)
     schedule = Schedule(config.schedule)
     if restored is None:
         table, progress = first_gaussians(config, capture, space, ranks, home)
@@ -95,17 +99,22 @@ def set_up(
         if ranks.rank == 0:
             warn_of_changes(folder, capture)
     lap("gaussians")
-    # The views and the spawn gate are compared with those of the checkpoint.
-    progress = keep_to_views(table, progress, capture, ranks)
-    veto, spawn_gate_digest = open_spawn_gate(config, capture, ranks, progress.gate)
-    progress = replace(progress, gate=spawn_gate_digest)
+    if not same_views:
+        forget_views(table, progress, capture, ranks)
+    progress.train_views = train_views
+    # The spawn gate is compared with that of the checkpoint.
+    veto, progress.gate = open_spawn_gate(config, capture, ranks, progress.gate)
     check_room(folder, table, ranks, config.population.max_gaussians)
 
     run_id = restored.run_id if restored is not None else ranks.broadcast_object(secrets.token_hex(4))
     if ranks.rank == 0:
         _describe(folder, config, capture, run_id, is_new=restored is None)
     optimiser = TableAdam(config.optimiser, schedule, space.extent, ranks.device)
-    owners = _tile_owners(ranks, progress, restored)
+    # Tensors that are the same on all ranks: costs of tiles, and exposures.
+    shared = {} if restored is None or not same_views else restored.shared
+    owners = TileOwners(ranks)
+    if "bounds" in shared and ranks.world_size > 1:
+        owners.restore(shared)
     views = ViewSet(list(capture.cameras), space, ranks.device)
     sampler = _sampler(config, capture, schedule)
     if config.memory.resident_gb > 0:
@@ -115,7 +124,7 @@ def set_up(
     upcoming = UpcomingCameras(sampler, capture.train, views)
     stepper = _stepper(config, table, optimiser, owners, space.extent, upcoming)
     if config.model.exposure:
-        stepper.exposures = _exposures(capture, images, ranks, progress, restored)
+        stepper.exposures = _exposures(capture, images, ranks, restored, same_views)
     lineage = _start_lineage(config, capture, folder, table, progress, ranks)
     lap("table")
     return TrainingState(
@@ -179,7 +188,9 @@ def _describe(folder: Path, config: Config, capture: Capture, run_id: str, is_ne
         save_world_frame(folder, capture.about.frame)
 
 
-def _resolved(config: Config, capture: Capture, restored: run_files.TrainedModel | None) -> Config:
+def _resolved(
+    config: Config, capture: Capture, restored: run_files.TrainedModel | None, same_views: bool
+) -> Config:
     """Return `config` with the values that depend on the training views and on what the run has measured.
 
     The depths of what the views see decide on the near plane (`model.near`). The number of views decides the
@@ -188,13 +199,12 @@ def _resolved(config: Config, capture: Capture, restored: run_files.TrainedModel
     `run_files.with_pace_of` says what a run measures.
     """
     schedule, loss = config.schedule, config.loss
-    if restored is not None:
-        known, own = restored.progress.train_views, restored.config
-        if known not in ("", train_views_fingerprint(capture)):
-            if schedule.images_per_view > 0:
-                schedule = replace(schedule, scale=own.schedule.scale, images_per_view=0.0)
-            if loss.opacity_total > 0:
-                loss = replace(loss, opacity=own.loss.opacity, opacity_total=0.0)
+    if restored is not None and not same_views:
+        own = restored.config
+        if schedule.images_per_view > 0:
+            schedule = replace(schedule, scale=own.schedule.scale, images_per_view=0.0)
+        if loss.opacity_total > 0:
+            loss = replace(loss, opacity=own.loss.opacity, opacity_total=0.0)
     model = config.model
     if model.near == 0:
         # Relative to the extent of this capture: a photograph that is lost later does not move the plane.
@@ -220,31 +230,19 @@ def _continued(
     return config if extend is None else extended(config, restored.progress.step, extend)
 
 
-def _tile_owners(ranks: Ranks, progress: Progress, restored: run_files.TrainedModel | None) -> TileOwners:
-    """Return the division of tiles, with the costs that the checkpoint has if they can be used."""
-    owners = TileOwners(ranks)
-    if restored is None or "bounds" not in restored.shared or ranks.world_size == 1:
-        return owners
-    # Tile costs and plans are stored by view index. With other views, they would belong to other images.
-    if restored.progress.train_views in ("", progress.train_views):
-        owners.restore(restored.shared)
-    return owners
-
-
 def _exposures(
     capture: Capture,
     images: ImageStore,
     ranks: Ranks,
-    progress: Progress,
     restored: run_files.TrainedModel | None,
+    same_views: bool,
 ) -> Exposures | None:
     """Return the photographs' exposures, from the checkpoint or the tracks; None if they are equal."""
     exposures = Exposures(capture.train, ranks)
     if restored is not None:
         if SHARED_EXPOSURES not in restored.shared:
             return None
-        # As with the tiles, rows are those of the same training views.
-        if restored.progress.train_views in ("", progress.train_views):
+        if same_views:
             exposures.restore(restored.shared)
             return exposures
     gains = track_gains(capture, images, ranks)

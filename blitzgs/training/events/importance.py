@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 
 import torch
@@ -61,9 +60,8 @@ def run_importance_pass(state: TrainingState, event: Event) -> None:
     redistribute(state.table, state.ranks, max_imbalance=0)
     sort_rows(state.table)
     state.stepper.reindex()
-    progress = state.progress
-    milestones = progress.milestones | {f"before_{event.kind}": before, f"after_{event.kind}": after}
-    state.progress = dataclasses.replace(progress, milestones=milestones, sorted_spread=0)
+    state.progress.milestones |= {f"before_{event.kind}": before, f"after_{event.kind}": after}
+    state.progress.sorted_spread = 0
     view_level.choose_views(state)
     counts = {"before": before, "gaussians": after, "views": views}
     state.log.event(event.time, event.kind, counts)
