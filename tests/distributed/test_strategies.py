@@ -10,11 +10,10 @@ import torch
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import run_files
 from blitzgs.training.events import densify
-from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
 from tests.distributed.test_training import require_agreement
 from tests.helpers import needs_cuda
-from tests.training.tiny import events_of, tiny_config, tiny_scene
+from tests.training.tiny import events_of, train
 
 # 30 steps of 2 images, with a checkpoint after 10, and density events after 28, 36, 44 and 52 images.
 SETTINGS = (
@@ -38,7 +37,7 @@ FIRST = Path("checkpoints") / "checkpoint_000000"
 def _train(ranks, folder, *overrides):
     torch.set_num_threads(1)
     densify.MAX_IMBALANCE = 1.02  # so that ranks of a few hundred Gaussians are redistributed
-    Trainer(tiny_config(*SETTINGS, *overrides), *tiny_scene(), folder, ranks, resume=True).train()
+    train(folder, *SETTINGS, *overrides, ranks=ranks, resume=True)
 
 
 @pytest.fixture(scope="module", params=OPTIONS)

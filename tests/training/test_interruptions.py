@@ -24,15 +24,10 @@ from blitzgs.runs.guard import NonFiniteError
 from blitzgs.spawn.lineage_parts import read_lineage
 from blitzgs.training.agreement import MAX_STEPS, Agreement, SaveClock, StopRequest
 from blitzgs.training.events import save
-from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
 from tests.helpers import refused, save_checkpoint
-from tests.training.tiny import assert_same_table, at_step, read_log, steps_of, tiny_config, tiny_scene
-
-
-def trainer(folder, *overrides, images=None, resume=False):
-    capture, own = tiny_scene()
-    return Trainer(tiny_config(*overrides), capture, images or own, folder, Ranks(), resume)
+from tests.training.tiny import assert_same_table, at_step, read_log, steps_of, tiny_config
+from tests.training.tiny import make_trainer as trainer
 
 
 def checkpoints(folder):
@@ -211,8 +206,7 @@ def test_a_lost_photograph_ends_the_run_in_time(monkeypatch, late):
 def test_records_that_are_written_a_step_later_are_the_same(tmp_path, monkeypatch, end):
     found = []
     for late in (False, True):
-        capture, images = tiny_scene()
-        running = trainer(tmp_path / str(late), "schedule.iterations=50", "log.every=1", images=images)
+        running = trainer(tmp_path / str(late), "schedule.iterations=50", "log.every=1")
         running._writes_late = late
         with monkeypatch.context() as patch:
             if end == "signal":
@@ -222,7 +216,7 @@ def test_records_that_are_written_a_step_later_are_the_same(tmp_path, monkeypatc
 
                 def lost(place, steps, get=get):
                     if place == 33:
-                        raise FileNotFoundError(errno.ENOENT, "No such file or directory", "/photos/00.png")
+                        raise FileNotFoundError("/photos/00.png")
                     return get(place, steps)
 
                 patch.setattr(running.loader, "get", lost)
@@ -246,18 +240,11 @@ def test_records_that_are_written_a_step_later_are_the_same(tmp_path, monkeypatc
 def test_a_photograph_that_vanishes_costs_nothing(tmp_path, monkeypatch):
     whole = trainer(tmp_path / "whole")
     whole.train()
-    capture, images = tiny_scene()
-    get = images.get
-
-    def gone(index, factor=1):
-        raise FileNotFoundError(errno.ENOENT, "No such file or directory", f"/photos/{index:02}.png")
-
-    at_step(monkeypatch, 40, lambda self: setattr(images, "get", gone))
-    running = trainer(tmp_path / "cut", images=images)
-    refused(PhotographError, r"/photos/0\d.png'.*put the photograph back.*--resume", running.train)
+    at_step(monkeypatch, 40, lambda self: self.state.images.lose())
+    running = trainer(tmp_path / "cut")
+    refused(PhotographError, r"/photos/0\d.png .*put the photograph back.*--resume", running.train)
     saved = run_files.restore(tmp_path / "cut", Ranks()).progress.step
     assert 40 <= saved <= 44  # some batches were loaded ahead
-    images.get = get
     monkeypatch.undo()
     resumed = trainer(tmp_path / "cut", resume=True)
     resumed.train()
@@ -265,19 +252,10 @@ def test_a_photograph_that_vanishes_costs_nothing(tmp_path, monkeypatch):
 
 
 def test_a_held_out_photograph_that_vanishes_costs_nothing(tmp_path):
-    capture, images = tiny_scene()
-    get = images.get
-
-    def held_out_is_gone(index, factor=1):
-        if index in capture.test:
-            raise ValueError(f"/photos/{index:02}.png is no JPEG or PNG file")
-        return get(index)
-
-    images.get = held_out_is_gone
-    running = trainer(tmp_path, "schedule.evaluate_every=30", images=images)
+    running = trainer(tmp_path, "schedule.evaluate_every=30")
+    running.state.images.lose(*running.state.capture.test, error=ValueError)
     refused(PhotographError, r"/photos/03.png.*put the photograph back.*--resume", running.train)
     assert run_files.restore(tmp_path, Ranks()).progress.step == 31
-    images.get = get
     assert trainer(tmp_path, "schedule.evaluate_every=30", resume=True).train() is not None
 
 
