@@ -23,7 +23,6 @@ from blitzgs.table.table import CULL, GaussianTable
 from blitzgs.training import view_level
 from blitzgs.training.events import evaluate
 from blitzgs.training.step import Stepper
-from blitzgs.training.trainer import Trainer
 from blitzgs.view.gate import centres_of
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.helpers import refused
@@ -33,6 +32,8 @@ from tests.training.tiny import (
     as_flags,
     assert_same_table,
     events_of,
+    lose_view,
+    make_trainer,
     steps_of,
     stop_at,
     tiny_config,
@@ -48,8 +49,17 @@ FLAGS = (
 )  # fmt: skip
 
 
-def train(folder, *overrides, resume=False):
-    return tiny.train(folder, *FLAGS, *overrides, resume=resume)
+def train(folder, *overrides, **how):
+    return tiny.train(folder, *FLAGS, *overrides, **how)
+
+
+def resume_without_a_view(folder, *overrides):
+    """Return a trainer that goes on without a photograph that the run began with."""
+    scene = tiny_scene()
+    lose_view(*scene, 1)
+    with pytest.warns(UserWarning, match="other views than the 6 of today: the cull mask is dropped"):
+        flags = (*FLAGS, *overrides, "data.allow_missing=true")
+        return make_trainer(folder, *flags, scene=scene, resume=True)
 
 
 @pytest.fixture(scope="module")
@@ -186,8 +196,7 @@ def test_levels_that_follow_footprints_leave_out_what_is_small_in_the_view(tmp_p
 
 
 def _train_on(ranks, folder):
-    trainer = Trainer(tiny_config(*FLAGS), *tiny_scene(), folder, ranks)
-    summary = trainer.train()
+    trainer, summary = train(folder, ranks=ranks)
     return summary["psnr"], trainer.state.progress.gated_views, CULL in trainer.state.table
 
 
@@ -255,15 +264,8 @@ def test_masks_stay_with_their_views_when_a_photograph_is_lost(tmp_path, monkeyp
     stop_at(monkeypatch, 75)
     before, _ = train(tmp_path)
     assert CULL in before.state.table and len(before.state.progress.gated_views) == 7
-    capture, images = tiny_scene()
-    del capture.cameras[1], images.images[1]
-    capture.train, capture.test = [0, 1, 3, 4, 5, 6], [2]
     stop_at(monkeypatch, 78)
-    config = tiny_config(*FLAGS, "data.allow_missing=true")
-    with pytest.warns(
-        UserWarning, match="trained on other views than the 6 of today: the cull mask is dropped"
-    ):
-        fewer = Trainer(config, capture, images, tmp_path, Ranks(), resume=True)
+    fewer = resume_without_a_view(tmp_path)
     assert CULL not in fewer.state.table
     assert fewer.train() is None
     assert len(fewer.state.progress.gated_views) == 6
@@ -278,12 +280,7 @@ def test_a_photograph_that_is_lost_changes_neither_length_nor_opacity_term_of_a_
     stop_at(monkeypatch, 75)
     before, _ = train(tmp_path, *longer)
     monkeypatch.undo()
-    capture, images = tiny_scene()
-    del capture.cameras[1], images.images[1]
-    capture.train, capture.test = [0, 1, 3, 4, 5, 6], [2]
-    config = tiny_config(*FLAGS, *longer, "data.allow_missing=true")
-    with pytest.warns(UserWarning, match="the cull mask is dropped"):
-        fewer = Trainer(config, capture, images, tmp_path, Ranks(), resume=True)
+    fewer = resume_without_a_view(tmp_path, *longer)
     fewer.close()
     assert fewer.state.progress.step == 75
     assert fewer.state.schedule.iterations == before.state.schedule.iterations > 6 * 20
