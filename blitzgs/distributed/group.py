@@ -21,8 +21,8 @@ from blitzgs.distributed.shared_memory import LEAST_WORDS, SharedMemory, control
 from blitzgs.distributed.watchdog import BUSY_SECONDS, NoWatchdog, Watchdog, open_store
 
 T = TypeVar("T")
-ReduceOp = Literal["sum", "min", "max"]
-_REDUCE_OPS = {"sum": dist.ReduceOp.SUM, "min": dist.ReduceOp.MIN, "max": dist.ReduceOp.MAX}
+ReduceOp = Literal["sum", "max"]
+_REDUCE_OPS = {"sum": dist.ReduceOp.SUM, "max": dist.ReduceOp.MAX}
 
 DEFAULT_TIMEOUT_SECONDS = 120.0
 # The environment variables that configure torch's CUDA allocator, the present one and the one before it.

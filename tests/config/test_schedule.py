@@ -4,14 +4,13 @@
 import itertools
 import math
 import random
-import re
 from dataclasses import replace
 
 import pytest
 import torch
 
 from blitzgs.config.fields import OptimiserConfig, ScheduleConfig
-from blitzgs.config.files import ConfigError, from_dict, load_config, save_config, to_dict
+from blitzgs.config.files import from_dict, load_config, save_config, to_dict
 from blitzgs.config.schedule import Pace, Schedule, stretched
 from blitzgs.optim.table_adam import BETA1, BETA2, EPS, TableAdam
 from tests.training.tiny import random_gaussians
@@ -58,21 +57,6 @@ def test_the_resolution_rises_at_its_times(scale):
         expected = 4 if begin < 100 * scale else 2 if begin < math.floor(902 * scale + 1e-6) else 1
         assert schedule.reduction(begin) == expected
     assert Schedule(ScheduleConfig()).reduction(0) == 1
-
-
-@pytest.mark.parametrize(
-    ("value", "message"),
-    [
-        ("[[3, 100]]", "factors must be 8, 4 or 2 and decrease, got [3]"),
-        ("[[2, 100], [4, 200]]", "factors must be 8, 4 or 2 and decrease, got [2, 4]"),
-        ("[[4, 200], [2, 200]]", "times must increase, got [200, 200]"),
-        ("[[2, 0]]", "must be in [1, 1,000,000,000], got ((2, 0),)"),
-        ("[2, 100]", "[0]: must be a list of 2 values, got 2"),
-    ],
-)
-def test_a_resolution_that_cannot_be_is_refused(value, message):
-    with pytest.raises(ConfigError, match=r"schedule\.resolution.*" + re.escape(message)):
-        load_config(None, [f"schedule.resolution={value}"])
 
 
 @pytest.mark.parametrize(
@@ -294,24 +278,6 @@ def test_pace_is_read_and_written(tmp_path):
     assert config.schedule.pace == ((16, 0.25), (40, 3.0))
     save_config(config, tmp_path / "config.yaml")
     assert load_config(tmp_path / "config.yaml") == config == from_dict(to_dict(config))
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["schedule.pace=[[16, 1], [16, 2]]"], r"schedule.pace: .* above 0 and increase, got \[16, 16\]"),
-        (["schedule.pace=[[16, 1e5]]"], r"schedule.pace: its factors must be in .*, got 100000.0"),
-        (["schedule.pace=[[0, 1]]"], r"schedule.pace: must be in .*, got \(\(0, 1.0\),\)"),
-        (["schedule.pace=[[16]]"], r"schedule.pace\[0\]: must be a list of 2 values, got \[16\]"),
-        (["schedule.pace=[[1.5, 2]]"], r"schedule.pace\[0\]\[0\]: must be an integer, got 1.5"),
-        (["schedule.pace=[[16, 9e3]]"], r"times schedule.scale must be at most 10,000,000 images"),
-        (["schedule.minutes=-1"], r"schedule.minutes: must be in \[0, 1,000,000\], got -1.0"),
-        (["schedule.minutes=3", "schedule.scale=0.5"], r"schedule.scale: must be 1 .*--minutes.* got 0.5"),
-    ],
-)
-def test_impossible_paces_and_budgets_are_refused(overrides, message):
-    with pytest.raises(ConfigError, match=message):
-        load_config(None, overrides)
 
 
 def test_every_piece_of_the_final_drift_has_its_own_step_numbers():

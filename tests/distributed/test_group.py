@@ -24,12 +24,9 @@ from tests.helpers import refused
 
 def _collectives(ranks):
     m, size, place = ranks.rank, ranks.world_size, ranks.device
-    assert ranks.all_reduce(torch.tensor([m, 10], device=place)).tolist() == [
-        size * (size - 1) // 2,
-        10 * size,
-    ]
+    sums = ranks.all_reduce(torch.tensor([m, 10], device=place))
+    assert sums.tolist() == [size * (size - 1) // 2, 10 * size]
     assert ranks.all_reduce(torch.tensor(m, device=place), "max").item() == size - 1
-    assert ranks.all_reduce(torch.tensor(float(m), device=place), "min").item() == 0
     # Rank m sends m + n + 1 rows to rank n, and nothing to itself.
     sent = [0 if n == m else m + n + 1 for n in range(size)]
     for dtype in (torch.int64, torch.uint8, torch.float32, torch.float16):

@@ -10,7 +10,6 @@ import torch
 import blitzgs
 from blitzgs.cli import main
 from blitzgs.config.fields import ScheduleConfig
-from blitzgs.config.files import ConfigError
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply, write_ply
@@ -25,7 +24,6 @@ from blitzgs.training.events import evaluate
 from blitzgs.training.step import Stepper
 from blitzgs.view.gate import centres_of
 from tests.distributed.rank_harness import on_each_device, run_ranks
-from tests.helpers import refused
 from tests.training import tiny
 from tests.training.tiny import (
     OVERRIDES,
@@ -36,7 +34,6 @@ from tests.training.tiny import (
     make_trainer,
     steps_of,
     stop_at,
-    tiny_config,
     tiny_scene,
     trained_in_parts,
     write_tiny_capture,
@@ -323,7 +320,3 @@ def test_the_mask_is_cleared_halfway_after_the_last_pass():
     assert cleared(t1=16_000, t2=100_000) == [53_000]  # the run ends before the second pass
     assert cleared(t1=0, t2=0) == []
     assert cleared(t1=16_000, t2=34_000, scale=0.5) == [31_000]
-
-
-def test_a_mask_needs_the_passes():
-    refused(ConfigError, "view.cull: needs population.importance=true", tiny_config, "view.cull=true")

@@ -223,7 +223,7 @@ def test_the_share_of_the_time_is_small(tmp_path, monkeypatch, cost):
     state.start_clock()
     spent = []
 
-    def measure(state, views, folder, lpips=None):
+    def measure(state, views, folder):
         now[0] += cost * len(views)
         spent.append(cost * len(views))
         return {"psnr": 20.0}
@@ -244,10 +244,10 @@ def test_a_lost_held_out_photograph_ends_the_glances_alone(tmp_path, monkeypatch
 
     found = glances.measure
 
-    def measure(state, views, folder, lpips=None):
+    def measure(state, views, folder):
         if folder is None and set(views) <= set(state.capture.test):
             raise PhotographError("03.png is gone")
-        return found(state, views, folder, lpips)
+        return found(state, views, folder)
 
     monkeypatch.setattr(glances, "measure", measure)
     _, summary = train(tmp_path)
