@@ -134,8 +134,9 @@ def test_nohup_is_respected_and_a_second_signal_does_not_interrupt_the_save():
         signal.signal(signal.SIGHUP, before)
 
 
-def _agreements(ranks, seconds, late):
+def _agreements(ranks, seconds, most, late):
     stop, clock = StopRequest(), SaveClock(0)
+    pytest.MonkeyPatch().setattr("blitzgs.training.agreement.MAX_SECONDS", most)
     agreement = Agreement(ranks, stop, clock)
     agreement._reads_late = late
     decisions = []
@@ -164,17 +165,10 @@ def _agreements(ranks, seconds, late):
     ],
 )
 def test_ranks_agree_after_the_same_step_and_slow_steps_do_not_wait(seconds, most, late, stop_at, save_at):
-    first, second = run_ranks(_agreements_within, 2, seconds, most, late)
+    first, second = run_ranks(_agreements, 2, seconds, most, late)
     assert first == second
     assert [step for step, (_, saves) in enumerate(first, 1) if saves] == [save_at]
     assert len(first) == stop_at and first[-1][0] == "SIGTERM"
-
-
-def _agreements_within(ranks, seconds, most, late):
-    from blitzgs.training import agreement
-
-    agreement.MAX_SECONDS = most
-    return _agreements(ranks, seconds, late)
 
 
 class TwoRanks(Ranks):
@@ -259,23 +253,22 @@ def test_a_held_out_photograph_that_vanishes_costs_nothing(tmp_path):
     assert trainer(tmp_path, "schedule.evaluate_every=30", resume=True).train() is not None
 
 
-def fail_saves(monkeypatch, count, also=lambda: None):
-    """Let the next `count` checkpoints fail as on a full disk."""
-    left = [count]
-    real = checkpoint.write_shard
+def fail_writes(monkeypatch, count, module=checkpoint, name="write_shard", also=lambda: None):
+    """Let the next `count` calls of a function that writes fail as on a full disk."""
+    failures, real = iter(range(count)), getattr(module, name)
 
-    def write_shard(*args):
-        if left[0]:
-            left[0] -= 1
+    def write(*args, **options):
+        if next(failures, None) is not None:
             also()
             raise OSError(errno.ENOSPC, "No space left on device")
-        return real(*args)
+        return real(*args, **options)
 
-    monkeypatch.setattr(checkpoint, "write_shard", write_shard)
+    monkeypatch.setattr(module, name, write)
+    return failures
 
 
 def test_a_full_disk_in_the_middle_is_survived(tmp_path, monkeypatch, capsys):
-    fail_saves(monkeypatch, 1)
+    fail_writes(monkeypatch, 1)
     monkeypatch.setattr(save, "RETRY_SECONDS", 0.0)
     summary = trainer(tmp_path, "schedule.checkpoint_every=50").train()
     assert summary is not None
@@ -285,7 +278,7 @@ def test_a_full_disk_in_the_middle_is_survived(tmp_path, monkeypatch, capsys):
 
 
 def test_the_last_checkpoint_waits_for_room(tmp_path, monkeypatch, capsys):
-    fail_saves(monkeypatch, 2)
+    fail_writes(monkeypatch, 2)
     monkeypatch.setattr(save, "FIRST_WAIT_SECONDS", 0.01)
     assert trainer(tmp_path).train() is not None
     shown = capsys.readouterr().out
@@ -294,7 +287,7 @@ def test_the_last_checkpoint_waits_for_room(tmp_path, monkeypatch, capsys):
 
 
 def test_waiting_for_room_ends_when_asked(tmp_path, monkeypatch):
-    fail_saves(monkeypatch, 9, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    fail_writes(monkeypatch, 9, also=lambda: os.kill(os.getpid(), signal.SIGTERM))
     monkeypatch.setattr(save, "FIRST_WAIT_SECONDS", 0.01)
     refused(checkpoint.CheckpointError, "the disk is full", trainer(tmp_path).train)
 
@@ -337,19 +330,11 @@ def test_a_file_in_the_place_of_the_checkpoints_ends_the_run_with_the_model_save
 
 def test_a_lineage_that_cannot_be_written_waits_as_well(tmp_path, monkeypatch):
     parquet = pytest.importorskip("pyarrow.parquet")
-    left, real = [2], parquet.write_table
-
-    def write_table(*args, **options):
-        if left[0]:
-            left[0] -= 1
-            raise OSError(errno.ENOSPC, "No space left on device")
-        real(*args, **options)
-
-    monkeypatch.setattr(parquet, "write_table", write_table)
+    failures = fail_writes(monkeypatch, 2, parquet, "write_table")
     monkeypatch.setattr(save, "FIRST_WAIT_SECONDS", 0.01)
     flags = ("population.lineage=true", "schedule.iterations=50")
     running = trainer(tmp_path, *flags)
-    assert running.train() is not None and left == [0]
+    assert running.train() is not None and not list(failures)
     births = read_lineage(tmp_path / "lineage")["births"]["id"]
     assert len(set(births.tolist())) == len(births) == running.state.lineage.ledger.births
 
