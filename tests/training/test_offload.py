@@ -21,6 +21,7 @@ from tests.training.tiny import (
     HEIGHT,
     WIDTH,
     Camera,
+    assert_same_table,
     photographed,
     random_gaussians,
     steps_of,
@@ -182,8 +183,7 @@ def test_a_model_with_a_cull_mask_is_rendered_through_a_pool(tmp_path, monkeypat
         assert torch.equal(render_view(finder, views, i, options, owners), image)
         assert image.std() > 0.01
     pool.write_back()
-    for name in whole:
-        assert torch.equal(model.table[name], whole[name]), name
+    assert_same_table(model.table, whole)
 
 
 def test_rows_are_sorted_for_a_pool_or_for_another_number_of_ranks(tmp_path):

@@ -269,7 +269,7 @@ def events_of(folder: Path, event: str) -> list[dict[str, Any]]:
 
 def assert_same_table(a: GaussianTable, b: GaussianTable) -> None:
     """Check that two tables hold the same bits."""
-    assert len(a) == len(b)
+    assert len(a) == len(b) and sorted(a) == sorted(b)
     for name in a:
         assert torch.equal(a[name], b[name]), name
 
