@@ -25,13 +25,17 @@ def all_events(config):
     return schedule, steps
 
 
+def density_events(schedule):
+    """Return the times of all density events."""
+    return [event.time for event in schedule.events(0, schedule.iterations) if event.kind == "densify"]
+
+
 def test_paper_schedule_densifies_thirty_times_and_last_at_31000():
     config = ScheduleConfig(
         iterations=90_000, batch_size=4, densify_from=2_000, densify_until=32_000, densify_every=1_000
     )
     schedule, steps = all_events(config)
-    times = [event.time for step in steps for event in step if event.kind == "densify"]
-    assert times == list(range(2_000, 32_000, 1_000))
+    assert density_events(schedule) == list(range(2_000, 32_000, 1_000))
     assert schedule.steps == 22_500
     for step, events in enumerate(steps):
         assert all(4 * step <= event.time < 4 * step + 4 for event in events)
@@ -42,10 +46,8 @@ def test_one_field_scales_every_time(scale):
     config = ScheduleConfig(
         iterations=3_000, densify_from=50, densify_until=1_500, densify_every=10, scale=scale
     )
-    schedule, steps = all_events(config)
-    times = [event.time for step in steps for event in step if event.kind == "densify"]
-    expected = sorted({math.floor(t * scale + 1e-6) for t in range(50, 1_500, 10)})
-    assert times == expected
+    schedule = Schedule(config)
+    assert density_events(schedule) == sorted({math.floor(t * scale + 1e-6) for t in range(50, 1_500, 10)})
     assert schedule.steps == math.floor(3_000 * scale + 1e-6)
 
 
@@ -149,7 +151,7 @@ def test_opacities_are_reset_while_densifying_and_after_the_density_event_of_the
 def test_the_last_density_event_is_known(scale, until):
     config = ScheduleConfig(scale=scale, iterations=3_000, densify_until=until, densify_every=100)
     schedule = Schedule(config)
-    times = [event.time for event in schedule.events(0, schedule.iterations) if event.kind == "densify"]
+    times = density_events(schedule)
     assert [schedule.is_last_density_event(time) for time in times] == [*[False] * (len(times) - 1), True]
 
 
@@ -209,7 +211,7 @@ def test_a_change_of_pace_does_not_change_past_events():
         assert kinds.count("pass_1") == kinds.count("pass_2") == 1
         # Two events at one image become one; no other event is lost.
         wanted = {math.floor(schedule.pace.image(time) + 1e-6) for time in range(50, 1_500, 40)}
-        assert [event.time for event in happened if event.kind == "densify"] == sorted(wanted)
+        assert density_events(schedule) == sorted(wanted)
 
 
 def test_rates_follow_the_configurations_own_times():

@@ -29,6 +29,7 @@ from tests.training.tiny import (
     lose_view,
     make_trainer,
     read_log,
+    sorted_rows,
     steps_of,
     stop_at,
     tiny_scene,
@@ -53,10 +54,7 @@ def train_on(ranks, folder, *overrides):
 
 
 def sorted_table(folder):
-    table = run_files.restore(folder, Ranks()).table
-    order = table["id"].argsort()
-    table.permute(order)
-    return table
+    return sorted_rows(run_files.restore(folder, Ranks()).table)
 
 
 @pytest.fixture(scope="module")

@@ -24,6 +24,7 @@ from tests.training.tiny import (
     assert_same_table,
     photographed,
     random_gaussians,
+    sorted_rows,
     steps_of,
     stop_at,
     trained_in_parts,
@@ -61,10 +62,7 @@ def train(folder, *overrides, device="cpu", resume=False):
 
 
 def assert_same_run(one, other):
-    tables = (one.state.table, other.state.table)
-    order, same = (table["id"].argsort() for table in tables)
-    for name in tables[0]:
-        assert torch.equal(tables[0][name][order].cpu(), tables[1][name][same].cpu()), name
+    assert_same_table(sorted_rows(one.state.table), sorted_rows(other.state.table))
     assert one.state.progress.peak_gaussians == other.state.progress.peak_gaussians
 
 
@@ -159,9 +157,7 @@ def test_two_ranks_share_a_run_beyond_their_memory(tmp_path):
         {name: torch.cat([share[name] for share in shares]) for name in shares[0]}
         for shares in (whole, pooled)
     )
-    order, same = expected["id"].argsort(), got["id"].argsort()
-    for name in expected:
-        assert torch.equal(got[name][same], expected[name][order]), name
+    assert_same_table(sorted_rows(got), sorted_rows(expected))
 
 
 def test_a_model_with_a_cull_mask_is_rendered_through_a_pool(tmp_path, monkeypatch):

@@ -19,6 +19,7 @@ from tests.training.tiny import (
     assert_same_table,
     events_of,
     make_trainer,
+    sorted_rows,
     steps_of,
     stop_at,
     tiny_scene,
@@ -266,9 +267,6 @@ def test_a_table_is_sorted_rarely_and_a_run_is_the_same_if_it_is_sorted_often(
             monkeypatch.setattr(densify, "MOST_SPREAD", 0.0)
         trainer, _ = train(tmp_path / name, *options)
         assert [event.get("sorted", 0) == 1 for event in events_of(tmp_path / name, "densify")] == sorts
-        table = trainer.state.table
-        order = table["id"].argsort()
-        tables.append({column: table[column][order] for column in table})
+        tables.append(sorted_rows(trainer.state.table))
     assert len(tables[0]["id"]) > 450
-    for column, values in tables[0].items():
-        assert torch.equal(values, tables[1][column]), column
+    assert_same_table(*tables)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -267,7 +267,13 @@ def events_of(folder: Path, event: str) -> list[dict[str, Any]]:
     return [record for record in read_log(folder) if record.get("event") == event]
 
 
-def assert_same_table(a: GaussianTable, b: GaussianTable) -> None:
+def sorted_rows(table: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the columns of a table, on the CPU, with the rows in the order of their ids."""
+    order = table["id"].argsort()
+    return {name: table[name][order].cpu() for name in table}
+
+
+def assert_same_table(a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> None:
     """Check that two tables hold the same bits."""
     assert len(a) == len(b) and sorted(a) == sorted(b)
     for name in a:
