@@ -74,7 +74,7 @@ class BatchSampler:
             first, batches = self._round = self._batches_before(index), self._batches_of(index)
         group, batch = batches[step - first]
         begin = batch * self.batch_size
-        return [self._view(group, position) for position in range(begin, begin + self.batch_size)]
+        return [self._at(group, position)[2] for position in range(begin, begin + self.batch_size)]
 
     def reduction(self, step: int) -> int:
         """Return by which factor the photographs of a step (0-based) are reduced."""
@@ -98,7 +98,7 @@ class BatchSampler:
             for k in range(self._group_batches(count, index), self._group_batches(count, index + 1))
         ]
         if self._places is not None:
-            return sorted(slots, key=lambda slot: self._time(slot[0], slot[1] * self.batch_size))
+            return sorted(slots, key=lambda slot: self._at(slot[0], slot[1] * self.batch_size)[:2])
         order = hash_keys(torch.arange(len(slots)), self._seed, index, 1).argsort()
         return [slots[position] for position in order.tolist()]
 
@@ -116,14 +116,11 @@ class BatchSampler:
         order = keys.argsort(stable=True)
         return views[order].tolist(), keys[order].tolist()
 
-    def _time(self, group: int, position: int) -> tuple[int, float]:
-        """Return when the view at a position of a group's sequence comes: its epoch and its key there."""
+    def _at(self, group: int, position: int) -> tuple[int, float, int]:
+        """Return what is at a position of a group's sequence: its epoch, its key there, and the view."""
         epoch, slot = divmod(position, self._counts[group])
-        return epoch, self._epoch(group, epoch)[1][slot]
-
-    def _view(self, group: int, position: int) -> int:
-        epoch, slot = divmod(position, self._counts[group])
-        return self._epoch(group, epoch)[0][slot]
+        views, keys = self._epoch(group, epoch)
+        return epoch, keys[slot], views[slot]
 
 
 def tour_of(cameras: Sequence[Camera], points: Float64) -> list[int]:
