@@ -55,12 +55,8 @@ class _Plan(NamedTuple):
     reduction: int  # by which factor the photographs are reduced
 
 
-class _Photograph(NamedTuple):
-    """The part of a view's photograph that a batch needs."""
-
-    strip: np.ndarray | None  # the pixel rows that this rank needs
-    mask: Tensor | None
-    samples: float
+# The part of a view's photograph that a batch needs: pixel rows, the mask, and `Batch.samples`.
+_Photograph = tuple[np.ndarray | None, Tensor | None, float]
 
 
 class _Slot:
@@ -270,12 +266,12 @@ class BatchLoader:
             if self._owners is None:
                 raise
             self.lost = self.lost or str(error)
-            return _Photograph(None, torch.zeros(size[::-1], dtype=torch.uint8), 3.0 * math.prod(size))
+            return None, torch.zeros(size[::-1], dtype=torch.uint8), 3.0 * math.prod(size)
         if (index, reduction) not in self._sample_counts:
             counted = math.prod(size) if mask is None else int((mask != 0).sum())
             self._masked.setdefault(index, counted < (1.0 - MAX_MASKED) * math.prod(size))
             self._sample_counts[index, reduction] = float(max(1, 3 * counted))
-        return _Photograph(strip, mask, self._sample_counts[index, reduction])
+        return strip, mask, self._sample_counts[index, reduction]
 
     def _fill(self, slot: _Slot, plan: _Plan, photographs: list[_Photograph]) -> Batch:
         indices, ranges, rows, reduction = plan

@@ -108,7 +108,11 @@ def set_up(
 
     run_id = restored.run_id if restored is not None else ranks.broadcast_object(secrets.token_hex(4))
     if ranks.rank == 0:
-        _describe(folder, config, capture, run_id, is_new=restored is None)
+        save_config(config, folder / run_files.CONFIG)
+        if restored is None or not (folder / CAMERAS).exists():
+            save_cameras(folder, capture, run_id)
+        if restored is None and capture.about.frame is not None:
+            save_world_frame(folder, capture.about.frame)
     optimiser = TableAdam(config.optimiser, schedule, space.extent, ranks.device)
     # Tensors that are the same on all ranks: costs of tiles, and exposures.
     shared = {} if restored is None or not same_views else restored.shared
@@ -178,14 +182,6 @@ def check_unclaimed(folder: Path, resume: bool) -> None:
         raise FileExistsError(
             f"{folder} already holds a run: add --resume to continue it, or choose another --out"
         )
-
-
-def _describe(folder: Path, config: Config, capture: Capture, run_id: str, is_new: bool) -> None:
-    save_config(config, folder / run_files.CONFIG)
-    if is_new or not (folder / CAMERAS).exists():
-        save_cameras(folder, capture, run_id)
-    if is_new and capture.about.frame is not None:
-        save_world_frame(folder, capture.about.frame)
 
 
 def _resolved(
