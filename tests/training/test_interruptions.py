@@ -29,6 +29,8 @@ from tests.helpers import refused, save_checkpoint
 from tests.training.tiny import assert_same_table, at_step, read_log, steps_of, tiny_config
 from tests.training.tiny import make_trainer as trainer
 
+SHORT = "schedule.iterations=20"
+
 
 def checkpoints(folder):
     return sorted(path.name for path in (folder / "checkpoints").glob("checkpoint_*"))
@@ -73,10 +75,10 @@ def test_a_checkpoint_is_written_by_the_clock_by_default(tmp_path, monkeypatch):
         self.state.save_clock.restart(0)
 
     at_step(monkeypatch, 33, ten_minutes_later)
-    trainer(tmp_path).train()
+    trainer(tmp_path, "schedule.iterations=40").train()
     folder = tmp_path / "checkpoints"
     states = [checkpoint.load(folder / name, Ranks(), "cpu").state for name in checkpoints(tmp_path)]
-    assert [state["progress"]["step"] for state in states] == [33, 100]
+    assert [state["progress"]["step"] for state in states] == [33, 40]
 
 
 @pytest.mark.parametrize("room", [0, 1 << 40])
@@ -102,7 +104,7 @@ def test_training_goes_on_while_a_checkpoint_is_written(tmp_path, monkeypatch, r
     monkeypatch.setattr(checkpoint, "write_shard", write_late)
     at_step(monkeypatch, 33, lambda self: self.state.save_clock.restart(0))
     at_step(monkeypatch, 36, go_on)
-    trainer(tmp_path).train()
+    trainer(tmp_path, "schedule.iterations=40").train()
     loaded = checkpoint.load(tmp_path / "checkpoints" / "checkpoint_000000", Ranks(), "cpu")
     assert loaded.state["progress"]["step"] == 33 and then == [room > 0, True]
     assert loaded.columns.keys() == saved["columns"].keys()
@@ -270,7 +272,7 @@ def fail_writes(monkeypatch, count, module=checkpoint, name="write_shard", also=
 def test_a_full_disk_in_the_middle_is_survived(tmp_path, monkeypatch, capsys):
     fail_writes(monkeypatch, 1)
     monkeypatch.setattr(save, "RETRY_SECONDS", 0.0)
-    summary = trainer(tmp_path, "schedule.checkpoint_every=50").train()
+    summary = trainer(tmp_path, SHORT, "schedule.checkpoint_every=10").train()
     assert summary is not None
     shown = capsys.readouterr().out.replace("\n", " ")
     assert "was not saved" in shown and "Training goes on" in shown
@@ -280,16 +282,16 @@ def test_a_full_disk_in_the_middle_is_survived(tmp_path, monkeypatch, capsys):
 def test_the_last_checkpoint_waits_for_room(tmp_path, monkeypatch, capsys):
     fail_writes(monkeypatch, 2)
     monkeypatch.setattr(save, "FIRST_WAIT_SECONDS", 0.01)
-    assert trainer(tmp_path).train() is not None
+    assert trainer(tmp_path, SHORT).train() is not None
     shown = capsys.readouterr().out
     assert shown.count("The model is still in memory: free some space") == 2
-    assert run_files.restore(tmp_path, Ranks()).progress.step == 100
+    assert run_files.restore(tmp_path, Ranks()).progress.step == 20
 
 
 def test_waiting_for_room_ends_when_asked(tmp_path, monkeypatch):
     fail_writes(monkeypatch, 9, also=lambda: os.kill(os.getpid(), signal.SIGTERM))
     monkeypatch.setattr(save, "FIRST_WAIT_SECONDS", 0.01)
-    refused(checkpoint.CheckpointError, "the disk is full", trainer(tmp_path).train)
+    refused(checkpoint.CheckpointError, "the disk is full", trainer(tmp_path, SHORT).train)
 
 
 @pytest.mark.parametrize(
@@ -306,7 +308,7 @@ def test_another_error_than_lack_of_space_saves_elsewhere_at_once(tmp_path, monk
 
     monkeypatch.setattr(checkpoint, "write_shard", write_shard)
     monkeypatch.setattr(save.time, "sleep", lambda seconds: pytest.fail("it waits"))
-    running = trainer(tmp_path / "run")
+    running = trainer(tmp_path / "run", SHORT)
     with pytest.raises(checkpoint.CheckpointError) as failure:
         running.train()
     message = str(failure.value)
@@ -315,7 +317,7 @@ def test_another_error_than_lack_of_space_saves_elsewhere_at_once(tmp_path, monk
     assert (f"The model is saved in {saved}: continue with --resume --out" in message) == elsewhere
     assert ("it is lost" in message) != elsewhere
     if elsewhere:
-        assert run_files.restore(saved, Ranks()).progress.step == 100
+        assert run_files.restore(saved, Ranks()).progress.step == 20
         assert open_run(saved).cameras().test == [3] and len(open_run(saved).model()) > 0
 
 
@@ -324,8 +326,8 @@ def test_a_file_in_the_place_of_the_checkpoints_ends_the_run_with_the_model_save
         shutil.rmtree(tmp_path / "checkpoints")
         (tmp_path / "checkpoints").touch()
 
-    at_step(monkeypatch, 50, replace_folder)
-    refused(checkpoint.CheckpointError, "The model is saved in .*rescued_", trainer(tmp_path).train)
+    at_step(monkeypatch, 10, replace_folder)
+    refused(checkpoint.CheckpointError, "The model is saved in .*rescued_", trainer(tmp_path, SHORT).train)
 
 
 def test_a_lineage_that_cannot_be_written_waits_as_well(tmp_path, monkeypatch):
@@ -371,12 +373,12 @@ def test_a_log_that_cannot_be_written_ends_nothing(tmp_path, monkeypatch):
 def test_an_evaluation_that_cannot_be_written_ends_nothing(tmp_path):
     tmp_path.joinpath("evaluation").write_text("not a folder")
     with pytest.warns(UserWarning, match="the evaluation could not write a file and goes on"):
-        assert trainer(tmp_path, "schedule.iterations=20").train()["psnr"] > 5
+        assert trainer(tmp_path, SHORT).train()["psnr"] > 5
 
 
 def test_a_log_of_another_run_or_with_a_torn_line_ends_nothing(tmp_path, monkeypatch):
     """A run that was killed before its first checkpoint leaves its log to the next one in the folder."""
-    trainer(tmp_path / "clean").train()
+    trainer(tmp_path / "clean", "schedule.iterations=50").train()
     other = {"t": 20, "run": "another", "event": "densify", "gaussians": 123_456_789}
     torn = '{"t": 20, "run": "another", "ev'
 
@@ -385,7 +387,7 @@ def test_a_log_of_another_run_or_with_a_torn_line_ends_nothing(tmp_path, monkeyp
             file.write(json.dumps(other) + "\n" + torn + "\n")
 
     at_step(monkeypatch, 1, add_records)
-    assert trainer(tmp_path / "second").train() is not None
+    assert trainer(tmp_path / "second", "schedule.iterations=50").train() is not None
     pictures = [(tmp_path / name / "trajectory.svg").read_text() for name in ("clean", "second")]
     assert pictures[0] == pictures[1]
 
@@ -400,7 +402,7 @@ def test_a_terminal_that_is_gone_ends_nothing(tmp_path, monkeypatch):
         flush = write
         isatty = staticmethod(lambda: False)
 
-    running = trainer(tmp_path)
+    running = trainer(tmp_path, SHORT)
     monkeypatch.setattr(sys, "stdout", Gone())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
