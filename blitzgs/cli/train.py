@@ -28,12 +28,12 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.runs import run_files
 from blitzgs.runs.folder_checks import locked
 from blitzgs.sfm.refine import fit_of
-from blitzgs.training.budget import LEAST_IMAGES, estimate
+from blitzgs.training.budget import LEAST_IMAGES
 from blitzgs.training.inputs import open_capture, read_ahead
 from blitzgs.training.setup import check_unclaimed
 from blitzgs.training.state import TrainingState
 from blitzgs.training.trainer import Trainer
-from blitzgs.training.understood import check_worlds, understood
+from blitzgs.training.understood import check_worlds, estimate, understood
 from blitzgs.util.output import check_outside
 from blitzgs.util.progress import Laps
 from blitzgs.util.terminal import printable

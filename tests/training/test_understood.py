@@ -22,12 +22,13 @@ from blitzgs.config.files import load_config
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.training import inputs
-from blitzgs.training.budget import _grown, estimate
 from blitzgs.training.understood import (
     HopelessCaptureError,
     _exposure,
+    _grown,
     _look,
     check_worlds,
+    estimate,
     large_images_hint,
     undistortion_note,
 )
