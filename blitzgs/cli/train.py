@@ -10,7 +10,7 @@ import shlex
 import sys
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from blitzgs.capture.colmap import find_models
 from blitzgs.cli.arguments import Commands, add_command, add_device, add_flags, number
 from blitzgs.cli.report import write_final_report
 from blitzgs.cli.sfm import understood_alone, with_poses
-from blitzgs.config.fields import Config, Transport
+from blitzgs.config.fields import Config
 from blitzgs.config.files import ConfigError, changed, default_recipe, load_config, recipe_path, to_dict
 from blitzgs.config.ranges import describe, describe_all, describe_page
 from blitzgs.distributed.group import Ranks
@@ -30,11 +30,11 @@ from blitzgs.runs.folder_checks import check_unclaimed, locked
 from blitzgs.runs.resume import check_before_capture
 from blitzgs.sfm.refine import fit_of
 from blitzgs.spawn.gate import RANDOM, SpawnGate, gate_file
-from blitzgs.training.budget import LEAST_IMAGES, estimate
+from blitzgs.training.budget import LEAST_IMAGES
 from blitzgs.training.inputs import open_capture, read_ahead
 from blitzgs.training.state import TrainingState
 from blitzgs.training.trainer import Trainer
-from blitzgs.training.understood import check_worlds, understood
+from blitzgs.training.understood import check_worlds, estimate, understood
 from blitzgs.util.errors import kept_warnings
 from blitzgs.util.output import check_outside
 from blitzgs.util.progress import Laps
@@ -193,7 +193,7 @@ def run(args: argparse.Namespace) -> None:
         Ranks.from_environment(
             args.device,
             job.timeout_seconds,
-            cast(Transport, job.transport),
+            job.transport,
             args.share_gpus,
             tables_on_host=config.memory.resident_gb > 0,
             lap=laps.lap,

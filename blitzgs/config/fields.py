@@ -1,14 +1,45 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The configuration of a run: one dataclass per section, with its fields' meaning and defaults.
+"""The configuration of a run: one dataclass per section, with its fields' meaning, defaults and ranges.
 
 Times are counted in images and are multiplied by `schedule.scale`. Lengths are relative to the scene's
 `extent` (1.1 x the largest distance of a training camera from the mean camera centre), never absolute.
+
+The ranges exclude values that cannot work (an infinite rate, an opacity of 2) or that would exhaust memory or
+never end; they are far from any sensible value.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
+
+
+@dataclass(frozen=True)
+class Range:
+    """The numbers from `low` to `high`; an end that is open is excluded."""
+
+    low: float
+    high: float
+    low_open: bool = False
+    high_open: bool = False
+
+    def __contains__(self, value: float) -> bool:
+        above = value > self.low if self.low_open else value >= self.low
+        return above and (value < self.high if self.high_open else value <= self.high)
+
+    def __str__(self) -> str:
+        brackets = "(" if self.low_open else "[", ")" if self.high_open else "]"
+        return f"in {brackets[0]}{self.low:,.12g}, {self.high:,.12g}{brackets[1]}"
+
+
+SCALE = Range(1e-4, 1e4)
+# Ranges of several fields.
+Share = Annotated[float, Range(0, 1)]
+Kept = Annotated[float, Range(0, 1, low_open=True)]
+Rate = Annotated[float, Range(0, 10)]
+Amount = Annotated[float, Range(0, 1e6)]
+Time = Annotated[int, Range(0, 1e9)]
+Interval = Annotated[int, Range(1, 1e9)]
 
 # How splats travel between ranks, and how an importance pass scores Gaussians.
 Transport = Literal["auto", "peer", "collective"]
@@ -45,16 +76,16 @@ class DataConfig:
 
     path: str = ""
     images: str = "images"
-    downscale: int = 1
+    downscale: Annotated[int, Range(1, 1000)] = 1
     masks: str | bool | None = None
     split: str = "auto"
-    undistort: str = "crop"
-    exif: str = "auto"
+    undistort: Literal["crop", "mask"] = "crop"
+    exif: Literal["auto", "apply", "ignore"] = "auto"
     allow_missing: bool = False
     inside_only: bool = False
     sparse: str = "largest"
-    stray_cameras: str = "drop"
-    cache_bytes: int = 8_000_000_000
+    stray_cameras: Literal["drop", "keep"] = "drop"
+    cache_bytes: Annotated[int, Range(0, 2**50)] = 8_000_000_000
 
 
 @dataclass(frozen=True)
@@ -78,10 +109,10 @@ class ModelConfig:
             coordinates; empty: Gaussians on the capture's points.
     """
 
-    sh_degree: int = 3
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sh_degree: Annotated[int, Range(0, 3)] = 3
+    background: Annotated[tuple[float, float, float], Range(0, 1)] = (0.0, 0.0, 0.0)
     antialiased: bool = False
-    near: float = 0.0
+    near: Amount = 0.0
     deterministic: bool = False
     exposure: bool = False
     start: str = ""
@@ -96,7 +127,7 @@ class LodConfig:
             cameras.
     """
 
-    visible_threshold: float = 0.9
+    visible_threshold: Annotated[float, Range(0, 1, high_open=True)] = 0.9
 
 
 # Ratio f of the voxel sizes of neighbouring octree levels.
@@ -151,25 +182,25 @@ class ScheduleConfig:
             them only at the end, and a few now and then, in less than 1 % of the time.
     """
 
-    iterations: int = 30_000
-    scale: float = 1.0
-    images_per_view: float = 0.0
-    minutes: float = 0.0
-    pace: tuple[tuple[int, float], ...] = ()
-    batch_size: int = 1
-    resolution: tuple[tuple[int, int], ...] = ()
-    densify_from: int = 500
-    densify_until: int = 15_000
-    densify_every: int = 100
-    size_prune_after: int = 3_000
-    reset_every: int = 0
-    gate_from: int = 11_250
-    t1: int = 7_500
-    t2: int = 16_000
-    sh_every: int = 1_000
-    position_decay: int = 30_000
-    checkpoint_every: int = 0
-    evaluate_every: int = 0
+    iterations: Interval = 30_000
+    scale: Annotated[float, SCALE] = 1.0
+    images_per_view: Amount = 0.0
+    minutes: Amount = 0.0
+    pace: Annotated[tuple[tuple[int, float], ...], Range(1e-4, 1e9)] = ()
+    batch_size: Annotated[int, Range(1, 32)] = 1
+    resolution: Annotated[tuple[tuple[int, int], ...], Range(1, 1e9)] = ()
+    densify_from: Time = 500
+    densify_until: Time = 15_000
+    densify_every: Interval = 100
+    size_prune_after: Time = 3_000
+    reset_every: Time = 0
+    gate_from: Time = 11_250
+    t1: Time = 7_500
+    t2: Time = 16_000
+    sh_every: Interval = 1_000
+    position_decay: Interval = 30_000
+    checkpoint_every: Time = 0
+    evaluate_every: Time = 0
 
 
 @dataclass(frozen=True)
@@ -187,13 +218,13 @@ class OptimiserConfig:
             rate (3DGS-MCMC's noise, with lengths relative to extent); 0: none.
     """
 
-    position: float = 1.6e-4
-    sh_dc: float = 2.5e-3
-    opacity: float = 2.5e-2
-    scale: float = 5e-3
-    rotation: float = 1e-3
-    final: float = 1.0
-    position_noise: float = 0.0
+    position: Share = 1.6e-4
+    sh_dc: Rate = 2.5e-3
+    opacity: Rate = 2.5e-2
+    scale: Rate = 5e-3
+    rotation: Rate = 1e-3
+    final: Annotated[float, Range(1e-9, 1)] = 1.0
+    position_noise: Annotated[float, Range(0, 1e12)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -212,11 +243,11 @@ class LossConfig:
         scale_reference: that axis is measured in units of extent x scale_reference.
     """
 
-    ssim: float = 0.2
-    opacity: float = 0.0
-    opacity_total: float = 0.0
-    scale: float = 10.0
-    scale_reference: float = 10.0
+    ssim: Share = 0.2
+    opacity: Amount = 0.0
+    opacity_total: Amount = 0.0
+    scale: Amount = 10.0
+    scale_reference: Annotated[float, Range(1e-6, 1e6)] = 10.0
 
 
 @dataclass(frozen=True)
@@ -276,28 +307,28 @@ class PopulationConfig:
             of a step that sees it. With fewer, its gradients are kept for the next density event.
     """
 
-    strategy: str = "density"
-    growth: float = 0.05
-    grad_threshold: float = 2e-4
-    clone_scale: float = 0.01
-    min_opacity: float = 0.005
-    prune_screen_radius: float = 20.0
-    prune_world_scale: float = 0.1
-    max_gaussians: int = 0
+    strategy: Literal["density", "relocation"] = "density"
+    growth: Rate = 0.05
+    grad_threshold: Annotated[float, Range(0, 1e30)] = 2e-4
+    clone_scale: Amount = 0.01
+    min_opacity: Annotated[float, Range(0, 1, high_open=True)] = 0.005
+    prune_screen_radius: Amount = 20.0
+    prune_world_scale: Amount = 0.1
+    max_gaussians: Annotated[int, Range(0, 1e11)] = 0
     importance: bool = False
-    score: str = "density"
-    pass1_keep: float = 0.7
-    pass2_mass: float = 0.99
-    pass2_keep: float = 1.0
-    pass2_views: int = 0
+    score: ScoreRule = "density"
+    pass1_keep: Kept = 0.7
+    pass2_mass: Kept = 0.99
+    pass2_keep: Kept = 1.0
+    pass2_views: Annotated[int, Range(0, 1e6)] = 0
     phi: bool = True
     gate: str | None = None
-    gate_rate: float = 0.6
-    gate_rule: str = "rank"
+    gate_rate: Share = 0.6
+    gate_rule: Literal["rank", "sample"] = "rank"
     lineage: bool = False
-    pixels_per_gaussian: float = 24.0
-    gaussians_per_point: float = 0.0
-    min_observations: int = 1
+    pixels_per_gaussian: Annotated[float, Range(0, 1e9)] = 24.0
+    gaussians_per_point: Amount = 0.0
+    min_observations: Annotated[int, Range(1, 1e6)] = 1
 
 
 @dataclass(frozen=True)
@@ -317,7 +348,7 @@ class ViewConfig:
     """
 
     lod: str | bool = False
-    footprint: float = 0.0
+    footprint: Annotated[float, Range(0, 1000)] = 0.0
     cull: bool = False
 
 
@@ -333,7 +364,7 @@ class MemoryConfig:
             on the device already. false: in random order.
     """
 
-    resident_gb: float = 0.0
+    resident_gb: Amount = 0.0
     tour: bool = False
 
 
@@ -347,8 +378,8 @@ class RanksConfig:
             Gloo) or "auto" ("peer" if it works, else "collective").
     """
 
-    timeout_seconds: float = 120.0
-    transport: str = "auto"
+    timeout_seconds: Annotated[float, Range(1, 1e6)] = 120.0
+    transport: Transport = "auto"
 
 
 @dataclass(frozen=True)
@@ -363,10 +394,10 @@ class LogConfig:
         keep_checkpoints: number of checkpoints that are kept on disk.
     """
 
-    every: int = 100
+    every: Interval = 100
     tensorboard: bool = True
-    checkpoint_seconds: float = 600.0
-    keep_checkpoints: int = 3
+    checkpoint_seconds: Annotated[float, Range(0, 1e9)] = 600.0
+    keep_checkpoints: Annotated[int, Range(1, 1e6)] = 3
 
 
 @dataclass(frozen=True)
@@ -388,7 +419,7 @@ class Config:
     memory: MemoryConfig = field(default_factory=MemoryConfig)
     ranks: RanksConfig = field(default_factory=RanksConfig)
     log: LogConfig = field(default_factory=LogConfig)
-    seed: int = 0
+    seed: Annotated[int, Range(0, 2**63 - 1)] = 0
 
 
 class ConfigError(ValueError):

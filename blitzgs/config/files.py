@@ -252,12 +252,7 @@ def _hint(name: str, known: list[str]) -> str:
     """Return what may have been meant by an unknown name: a similar one, else a field of another section."""
     if close := difflib.get_close_matches(name, known, n=1):
         return f"did you mean '{close[0]}'?"
-    sections = typing.get_type_hints(Config)
-    fields = [
-        f"{section}.{name}"
-        for section, kind in sections.items()
-        if dataclasses.is_dataclass(kind) and name in typing.get_type_hints(kind)
-    ]
+    fields = [field for field in flat(to_dict(Config())) if field.rpartition(".")[2] == name]
     return f"did you mean '{fields[0]}'?" if fields else f"known: {', '.join(known)}"
 
 
@@ -265,6 +260,10 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return _build(typing.cast(type, hint), value, path)
     origin, options = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Literal:
+        if value not in options:
+            raise ConfigError(f"{path}: must be one of {', '.join(options)}, got {value}")
+        return value
     if origin in (types.UnionType, typing.Union):
         if value is None or (isinstance(value, bool) and bool in options):
             return value

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The allowed values of every configuration field, and the description of fields for --help.
-
-A test checks that every field has an entry. The limits exclude values that cannot work (an infinite rate, an
-opacity of 2) or that would exhaust memory or never end; they are far from any sensible value.
-"""
+"""The allowed values of configuration fields, checks of several fields together, and the text of --help."""
 
 from __future__ import annotations
 
@@ -17,84 +13,43 @@ import textwrap
 import types
 import typing
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import yaml
 
 from blitzgs.config.fields import (
     MAX_STRETCH,
     RESET_OPACITY,
+    SCALE,
     Config,
     ConfigError,
+    Range,
     ScheduleConfig,
-    ScoreRule,
-    Transport,
 )
-
-
-@dataclass(frozen=True)
-class Range:
-    """The numbers from `low` to `high`; an end that is open is excluded."""
-
-    low: float
-    high: float
-    low_open: bool = False
-    high_open: bool = False
-
-    def __contains__(self, value: float) -> bool:
-        above = value > self.low if self.low_open else value >= self.low
-        return above and (value < self.high if self.high_open else value <= self.high)
-
-    def __str__(self) -> str:
-        brackets = "(" if self.low_open else "[", ")" if self.high_open else "]"
-        return f"in {brackets[0]}{self.low:,.12g}, {self.high:,.12g}{brackets[1]}"
-
 
 # Factors of `schedule.resolution`: float32 intrinsics are divided by them exactly.
 REDUCTIONS = (2, 4, 8)
 # Images of a whole run: its table of learning rates takes 48 bytes a step.
 MAX_IMAGES = 10_000_000
-SCALE = Range(1e-4, 1e4)
 
-_FIELDS: Mapping[Range, str] = {
-    Range(0, 1): "model.background optimiser.position loss.ssim population.gate_rate",
-    Range(0, 1, high_open=True): "lod.visible_threshold population.min_opacity",
-    Range(0, 1, low_open=True): "population.pass1_keep population.pass2_mass population.pass2_keep",
-    Range(0, 3): "model.sh_degree",
-    Range(0, 10): "optimiser.sh_dc optimiser.opacity optimiser.scale optimiser.rotation population.growth",
-    Range(0, 1000): "view.footprint",
-    Range(0, 1e6): "model.near schedule.images_per_view schedule.minutes loss.opacity loss.opacity_total "
-    "loss.scale population.clone_scale population.prune_screen_radius population.prune_world_scale "
-    "population.gaussians_per_point population.pass2_views memory.resident_gb",
-    Range(0, 1e9): "schedule.densify_from schedule.densify_until schedule.size_prune_after "
-    "schedule.reset_every schedule.gate_from schedule.t1 schedule.t2 schedule.checkpoint_every "
-    "schedule.evaluate_every population.pixels_per_gaussian log.checkpoint_seconds",
-    Range(0, 1e11): "population.max_gaussians",
-    Range(0, 1e12): "optimiser.position_noise",
-    Range(0, 1e30): "population.grad_threshold",
-    Range(0, 2**50): "data.cache_bytes",
-    Range(0, 2**63 - 1): "seed",
-    Range(1e-9, 1): "optimiser.final",
-    Range(1e-6, 1e6): "loss.scale_reference",
-    SCALE: "schedule.scale",
-    Range(1e-4, 1e9): "schedule.pace",
-    Range(1, 32): "schedule.batch_size",
-    Range(1, 1000): "data.downscale",
-    Range(1, 1e6): "population.min_observations ranks.timeout_seconds log.keep_checkpoints",
-    Range(1, 1e9): "schedule.iterations schedule.resolution schedule.densify_every schedule.sh_every "
-    "schedule.position_decay log.every",
+
+# The class of each section; that of "" has the fields without a section.
+_SECTIONS: Mapping[str, Any] = {"": Config} | {
+    name: kind for name, kind in get_type_hints(Config).items() if dataclasses.is_dataclass(kind)
 }
-RANGES: Mapping[str, Range] = {name: found for found, names in _FIELDS.items() for name in names.split()}
-
+# Of all fields, by names such as "section.field".
+_HINTS: Mapping[str, Any] = {
+    f"{section}.{name}".lstrip("."): hint
+    for section, kind in _SECTIONS.items()
+    for name, hint in get_type_hints(kind, include_extras=True).items()
+    if not dataclasses.is_dataclass(hint)
+}
+# The numbers and the texts that a field may have, by its name.
+RANGES: Mapping[str, Range] = {
+    name: hint.__metadata__[0] for name, hint in _HINTS.items() if get_origin(hint) is Annotated
+}
 CHOICES: Mapping[str, tuple[str, ...]] = {
-    "data.undistort": ("crop", "mask"),
-    "data.exif": ("auto", "apply", "ignore"),
-    "data.stray_cameras": ("drop", "keep"),
-    "ranks.transport": get_args(Transport),
-    "population.strategy": ("density", "relocation"),
-    "population.score": get_args(ScoreRule),
-    "population.gate_rule": ("rank", "sample"),
+    name: get_args(hint) for name, hint in _HINTS.items() if get_origin(hint) is Literal
 }
 
 
@@ -103,8 +58,6 @@ def problems(config: Config) -> Iterator[str]:
     for name, value in flat(dataclasses.asdict(config)).items():
         if name in RANGES and not all(number in RANGES[name] for number in _numbers(value)):
             yield f"{name}: must be {RANGES[name]}, got {value}"
-        if name in CHOICES and value not in CHOICES[name]:
-            yield f"{name}: must be one of {', '.join(CHOICES[name])}, got {value}"
     schedule, population = config.schedule, config.population
     yield from _problems_of_length(schedule)
     yield from _problems_of_resolution(schedule)
@@ -185,34 +138,32 @@ def describe(wanted: str) -> str:
     ConfigError: there is no such field.
     """
     name = wanted.lstrip("-").partition("=")[0]
-    sections = _sections()
-    if name in sections:
+    if name in _SECTIONS:
         return _section(name)
-    fields = [(section, field) for section, kind in sections.items() for field in _fields(kind)]
-    found = [(section, field) for section, field in fields if name in (field, _joined(section, field))]
+    found = [field for field in _HINTS if name in (field, field.rpartition(".")[2])]
     if not found:
-        known = [_joined(section, field) if "." in name else field for section, field in fields]
-        close = difflib.get_close_matches(name, dict.fromkeys([*known, *sections]), n=3)
+        known = [field if "." in name else field.rpartition(".")[2] for field in _HINTS]
+        close = difflib.get_close_matches(name, dict.fromkeys([*known, *_SECTIONS]), n=3)
         hint = f"did you mean {', '.join(close)}?" if close else "--help-fields describes all fields"
         raise ConfigError(f"{name}: there is no such field of the configuration; {hint}")
-    return "\n\n".join(_field(section, field) for section, field in found)
+    return "\n\n".join(map(_field, found))
 
 
 def describe_all() -> str:
     """Describe all sections and fields."""
-    return "\n\n\n".join(_section(name) for name in _sections())
+    return "\n\n\n".join(map(_section, _SECTIONS))
 
 
 def describe_page() -> str:
     """Return docs/configuration.md: the first sentence about every field, in a table for each section."""
     parts = [_PAGE_HEAD]
-    for section, kind in _sections().items():
+    for section in _SECTIONS:
         if section:
-            parts.append(f"## {section}\n\n{_about(kind).partition(chr(10))[0]}")
+            parts.append(f"## {section}\n\n{_about(section).partition(chr(10))[0]}")
         rows = ["field|default|meaning", "---|---|---"]
-        for names, meaning in _entries(kind).items():
-            fields = ", ".join(f"`{_joined(section, name)}`" for name in names)
-            defaults = ", ".join(f"`{_default(kind, name)}`" for name in names)
+        for names, meaning in _entries(section).items():
+            fields = ", ".join(f"`{name}`" for name in names)
+            defaults = ", ".join(f"`{_default(name)}`" for name in names)
             rows.append(f"{fields}|{defaults}|{_first_clause(meaning)}")
         parts.append("\n".join(rows))
     return "\n\n".join(parts)
@@ -228,65 +179,52 @@ def _first_clause(text: str) -> str:
     return text
 
 
-def _sections() -> dict[str, type]:
-    """Return the class of each section; that of "" has the fields without a section."""
-    found: dict[str, Any] = {"": Config}
-    hints = typing.get_type_hints(Config)
-    return found | {name: kind for name, kind in hints.items() if dataclasses.is_dataclass(kind)}
+def _section(section: str) -> str:
+    about = f"{section}: {_about(section)}" if section else _about(section)
+    fields = [name for name in _HINTS if name.rpartition(".")[0] == section]
+    return "\n\n".join([about, *map(_field, fields)])
 
 
-def _fields(kind: type) -> dict[str, Any]:
-    hints = typing.get_type_hints(kind)
-    return {name: hint for name, hint in hints.items() if not dataclasses.is_dataclass(hint)}
-
-
-def _joined(section: str, field: str) -> str:
-    return f"{section}.{field}" if section else field
-
-
-def _section(name: str) -> str:
-    kind = _sections()[name]
-    about = f"{name}: {_about(kind)}" if name else _about(kind)
-    return "\n\n".join([about, *(_field(name, field) for field in _fields(kind))])
-
-
-def _about(kind: type) -> str:
+def _about(section: str) -> str:
     """Return what the docstring of a section says before its fields."""
-    return (inspect.getdoc(kind) or "").partition("\nAttributes:")[0].strip()
+    return (inspect.getdoc(_SECTIONS[section]) or "").partition("\nAttributes:")[0].strip()
 
 
-def _field(section: str, field: str) -> str:
-    """Return a line with kind, default and allowed values, and the meaning below it."""
-    kind, name = _sections()[section], _joined(section, field)
-    allowed = f", {RANGES[name]}" if name in RANGES else ""
-    head = f"--{name}={_default(kind, field)}   ({_type(_fields(kind)[field])}{allowed})"
-    names, meaning = next(entry for entry in _entries(kind).items() if field in entry[0])
+def _field(name: str) -> str:
+    """Return a line with default, kind and allowed values, and the meaning below it."""
+    names, meaning = next(entry for entry in _entries(name.rpartition(".")[0]).items() if name in entry[0])
     # Fields that share their meaning begin with all their names.
-    text = (f"({', '.join(names)}) " if len(names) > 1 else "") + meaning
+    text = (f"({', '.join(name.rpartition('.')[2] for name in names)}) " if len(names) > 1 else "") + meaning
+    head = f"--{name}={_default(name)}   ({_type(_HINTS[name])})"
     return f"{head}\n{textwrap.indent(textwrap.fill(text, _WIDTH), '    ')}"
 
 
-def _default(kind: type, field: str) -> str:
-    value = getattr(kind(), field)
+def _default(name: str) -> str:
+    value = flat(dataclasses.asdict(Config()))[name]
     plain = list(value) if isinstance(value, tuple) else value
     return yaml.safe_dump(plain, default_flow_style=True).split("\n...")[0].strip()
 
 
 def _type(hint: Any) -> str:
-    """Return the kind of a field's values as text."""
-    origin, options = typing.get_origin(hint), typing.get_args(hint)
+    """Return the kind of a field's values, and those that are allowed, as text."""
+    origin, options = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return f"{_type(options[0])}, {options[1]}"
+    if origin is Literal:
+        return f"one of {', '.join(options)}"
     if origin in (types.UnionType, typing.Union):
-        return " or ".join(_type(option) for option in options)
+        return " or ".join(map(_type, options))
     if origin is tuple:
         return "list" if options[-1] is Ellipsis else f"list of {len(options)}"
-    return _KINDS.get(hint, "value")
+    return _KINDS[hint]
 
 
-def _entries(kind: type) -> dict[tuple[str, ...], str]:
+def _entries(section: str) -> dict[tuple[str, ...], str]:
     """Return the meaning of the fields that share one, from the part "Attributes:" of a docstring."""
-    text = (inspect.getdoc(kind) or "").partition("Attributes:\n")[2]
+    text = (inspect.getdoc(_SECTIONS[section]) or "").partition("Attributes:\n")[2]
     entries: dict[tuple[str, ...], str] = {}
     for entry in filter(str.strip, re.split(r"^    (?=\S)", text, flags=re.MULTILINE)):
         names, _, meaning = entry.partition(":")
-        entries[tuple(name.strip() for name in names.split(","))] = " ".join(meaning.split())
+        fields = tuple(f"{section}.{name.strip()}".lstrip(".") for name in names.split(","))
+        entries[fields] = " ".join(meaning.split())
     return entries

@@ -115,31 +115,26 @@ class Schedule:
     def _search(self, begin: int, end: int) -> list[Event]:
         """See `events`."""
         config = self._config
+        # The cull mask is dropped halfway between the last importance pass and the end. A pass that is set
+        # to a time after the end does not happen.
+        last = max(time for time in (0, config.t1, config.t2) if time < config.iterations)
+        middle = (last + config.iterations) // 2
         series: list[tuple[EventKind, float, float, float]] = [
             ("densify", config.densify_from, config.densify_until, config.densify_every),
             # A reset happens after the density event of the same image.
             ("reset_opacities", config.reset_every, config.densify_until, config.reset_every),
             ("pass_1", config.t1, config.t1 + 1, min(config.t1, 1)),
             ("pass_2", config.t2, config.t2 + 1, min(config.t2, 1)),
-            self._clear_cull(),
+            ("clear_cull", middle, middle + 1, min(last, 1)),
             ("evaluate", config.evaluate_every, math.inf, config.evaluate_every),
             ("checkpoint", config.checkpoint_every, math.inf, config.checkpoint_every),
         ]
-        found = [
+        return sorted(
             Event(time, order, kind)
             for order, (kind, first, until, every) in enumerate(series)
             if every > 0
             for time in self._series(first, until, every, begin, end)
-        ]
-        return sorted(found)
-
-    def _clear_cull(self) -> tuple[EventKind, float, float, float]:
-        """Return when the cull mask is dropped: halfway between the last importance pass and the end."""
-        config = self._config
-        # A pass that is set to a time after the end does not happen.
-        last = max(time for time in (0, config.t1, config.t2) if time < config.iterations)
-        time = math.floor((last + config.iterations) / 2)
-        return "clear_cull", time, time + 1, min(last, 1)
+        )
 
     def _series(self, first: float, until: float, every: float, begin: int, end: int) -> list[int]:
         """Return the images in [begin, end) of the times first + k every < until."""

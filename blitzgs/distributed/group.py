@@ -22,8 +22,8 @@ from blitzgs.distributed.watchdog import BUSY_SECONDS, NoWatchdog, Watchdog, ope
 from blitzgs.util.errors import UserError
 
 T = TypeVar("T")
-ReduceOp = Literal["sum", "min", "max"]
-_REDUCE_OPS = {"sum": dist.ReduceOp.SUM, "min": dist.ReduceOp.MIN, "max": dist.ReduceOp.MAX}
+ReduceOp = Literal["sum", "max"]
+_REDUCE_OPS = {"sum": dist.ReduceOp.SUM, "max": dist.ReduceOp.MAX}
 
 DEFAULT_TIMEOUT_SECONDS = 120.0
 # The environment variables that configure torch's CUDA allocator, the present one and the one before it.
@@ -194,12 +194,8 @@ class Ranks:
         `counts`: int64 [M] or [M, C] on `device`; row m is what goes to rank m. Returns a tensor of the same
         shape: row m is what comes from rank m.
         """
-        if self.world_size == 1:
-            return counts.clone()
-        received = torch.empty_like(counts)
-        with self.watchdog.waiting("exchange_counts"):
-            dist.all_to_all_single(received, counts.contiguous())
-        return received
+        one_each = [1] * self.world_size
+        return self.all_to_all(counts, one_each, one_each)
 
     def all_to_all(self, rows: Tensor, sent: Sequence[int], received: Sequence[int]) -> Tensor:
         """Send consecutive groups of rows, one to each rank, and return those received, by source rank.

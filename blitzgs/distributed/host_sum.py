@@ -29,38 +29,6 @@ class _Side(NamedTuple):
     ready: torch.cuda.Event
 
 
-class _Queued:
-    """The memory that the second stream uses for sums that the host has not read yet.
-
-    Torch assumes that the tensors of the step are used on the step's stream alone, and gives their memory to
-    new tensors as soon as no variable refers to them. They are kept here until the second stream has read
-    them. `memory`, float32 [words], is pinned; the event `written` is recorded after the copy to it.
-    """
-
-    def __init__(self, side: _Side, words: int, tensors: tuple[Tensor | None, ...]) -> None:
-        self._side = side
-        self._tensors: tuple[Tensor | None, ...] = ()  # `__del__` reads it even if `take` raises an error
-        # Powers of two, so that images of many sizes share few pieces of pinned memory.
-        length = 1 << (words - 1).bit_length()
-        self._pinned = PinnedNumbers.take(length, torch.float32, side.stream.device)
-        self._tensors = tensors
-        self.memory, self.written = self._pinned.memory[:words], self._pinned.written
-
-    def has_ended(self) -> None:
-        """Release the memory: the host has waited for `written` and copied the numbers."""
-        self._pinned.give_back()
-        self._tensors = ()
-
-    def __del__(self) -> None:
-        # If the host never read the sums, the second stream may still use the tensors, so torch must not
-        # reuse their memory before that stream has passed this point. (Torch delays the reuse of the pinned
-        # memory itself, because it queued the copy.) The host does not wait here: if a rank has failed, the
-        # sums never arrive.
-        for tensor in self._tensors:
-            if tensor is not None:
-                tensor.record_stream(self._side.stream)
-
-
 class HostSum:
     """Sums of the loss over all ranks, and the costs of all tiles, which the host reads later. Collective.
 
@@ -85,16 +53,23 @@ class HostSum:
         self._ranks = ranks
         self._sums = 0 if parts is None else 2 * parts.shape[0]
         self._total: Tensor | None = None
-        self._queued: _Queued | None = None
+        self._pinned: PinnedNumbers | None = None
+        self._tensors: tuple[Tensor | None, ...] = ()
         words = ranks.world_size * self._sums + (0 if tile_work is None else tile_work.shape[0])
-        side = _side_of(ranks.device)
+        self._side = side = _side_of(ranks.device)
         if side is None:
             value = torch.zeros(words)
             report_(parts, tile_work, tiles, ranks.rank, ranks.world_size, [value])
             self._numbers = ranks.all_reduce(value).numpy()
             return
-        self._queued = _Queued(side, words, (parts, tile_work))
-        self._numbers = self._queued.memory.numpy()
+        # Powers of two, so that images of many sizes share few pieces of pinned memory.
+        self._pinned = PinnedNumbers.take(1 << (words - 1).bit_length(), torch.float32, side.stream.device)
+        # Torch assumes that the tensors of the step are used on the step's stream alone, and gives their
+        # memory to new tensors as soon as no variable refers to them. They are kept until the second stream
+        # has read them.
+        self._tensors = parts, tile_work
+        memory = self._pinned.memory[:words]
+        self._numbers = memory.numpy()
         main = current_stream(ranks.device)
         side.ready.record(main)
         side.stream.wait_event(side.ready)
@@ -102,8 +77,8 @@ class HostSum:
         torch.cuda.set_stream(side.stream)
         try:
             total = self._queue(parts, tile_work, tiles, words)
-            self._queued.memory.copy_(total, non_blocking=True)
-            self._queued.written.record(side.stream)
+            memory.copy_(total, non_blocking=True)
+            self._pinned.written.record(side.stream)
         finally:
             torch.cuda.set_stream(main)
 
@@ -130,15 +105,24 @@ class HostSum:
         of each view, then the cost of each of the T tiles.
         """
         if self._total is None:
-            if self._queued is not None:
+            if self._pinned is not None:
                 with self._ranks.watchdog.waiting("read_sums"):
-                    self._queued.written.synchronize()
+                    self._pinned.written.synchronize()
             self._total = self._folded(self._numbers)
             del self._numbers
-            if self._queued is not None:
-                self._queued.has_ended()
-                self._queued = None
+            if self._pinned is not None:
+                self._pinned.give_back()
+                self._pinned, self._tensors = None, ()
         return self._total
+
+    def __del__(self) -> None:
+        # If the host never read the sums, the second stream may still use the tensors, so torch must not
+        # reuse their memory before that stream has passed this point. (Torch delays the reuse of the pinned
+        # memory itself, because it queued the copy.) The host does not wait here: if a rank has failed, the
+        # sums never arrive.
+        for tensor in self._tensors:
+            if tensor is not None and self._side is not None:
+                tensor.record_stream(self._side.stream)
 
     def _folded(self, numbers: NDArray[np.float32]) -> Tensor:
         """Add up the sums of the ranks in the order of the ranks; the result is a copy."""

@@ -55,52 +55,58 @@ class _Plan(NamedTuple):
     reduction: int  # by which factor the photographs are reduced
 
 
-class _Photograph(NamedTuple):
-    """The part of a view's photograph that a batch needs."""
-
-    strip: np.ndarray | None  # the pixel rows that this rank needs
-    mask: Tensor | None
-    samples: float
+# The part of a view's photograph that a batch needs: pixel rows, the mask, and `Batch.samples`.
+_Photograph = tuple[np.ndarray | None, Tensor | None, float]
 
 
-class _BatchMemory:
-    """Memory in which batches of one shape are assembled and from which they are uploaded.
+class _Slot:
+    """Memory in which batches are assembled and from which they are uploaded, one after the other.
 
     On the CPU, host memory and device memory are the same. All parts of a batch are in one allocation, so
     that few calls upload it: during each call, this thread and the thread that launches kernels may block
     each other.
     """
 
-    def __init__(self, shape: tuple[int, int, int, bool], device: torch.device) -> None:
-        self.shape = shape  # views, height, width, and whether there are masks
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._shape = (0, 0, 0, False)
+        if device.type == "cuda":
+            # After the upload of the newest batch, and after all work that reads it.
+            self.uploaded, self.consumed = torch.cuda.Event(), torch.cuda.Event()
+
+    def reserve(self, shape: tuple[int, int, int, bool]) -> None:
+        """Reserve memory for batches with so many views, height, width, and with masks or not."""
+        if shape == self._shape:
+            return
         count, height, width, masked = shape
-        area, on_gpu = count * height * width, device.type == "cuda"
+        area, on_gpu = count * height * width, self._device.type == "cuda"
         # Each part begins at a multiple of 256 bytes, as a separate tensor would.
         self._begin = _aligned(4 * count * (VIEW_NUMBERS + 1))
         self._end = _aligned(self._begin + 3 * area)
         size = self._end + masked * area
         self._host = torch.empty(size, dtype=torch.uint8, pin_memory=on_gpu)
-        self._device = torch.empty(size, dtype=torch.uint8, device=device) if on_gpu else self._host
+        self._on_device = torch.empty(size, dtype=torch.uint8, device=self._device) if on_gpu else self._host
+        self._shape = shape
         # On the host: views as `ViewSet.write` writes them, then each view's samples; uint8 [B, H, W, 3]; and
         # uint8 [B, H, W], 0 = excluded pixel.
         numbers, pixels, included = self._parts(self._host)
         self.numbers, self.pixels = numbers.numpy(), pixels.numpy()
         self.included = None if included is None else included.numpy()
-        numbers, self._targets, self._masks = self._parts(self._device)
+        numbers, self._targets, self._masks = self._parts(self._on_device)
         self._views = unpack_views(numbers[:-count], width, height)
         self._samples = numbers[-count:]
 
     def _parts(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        count, height, width, masked = self.shape
+        count, height, width, masked = self._shape
         numbers = memory[: 4 * count * (VIEW_NUMBERS + 1)].view(torch.float32)
         pixels = memory[self._begin :][: 3 * count * height * width].view(count, height, width, 3)
         return numbers, pixels, memory[self._end :].view(count, height, width) if masked else None
 
     def upload(self, rows: list[tuple[int, int]]) -> None:
         """Upload from the first to the last needed pixel row; `rows` has those of each view, [y0, y1)."""
-        if self._device is self._host:
+        if self._on_device is self._host:
             return
-        count, height, width, _ = self.shape
+        count, height, width, _ = self._shape
         needed = [view * height + y for view, (y0, y1) in enumerate(rows) if y0 < y1 for y in (y0, y1)]
         first, last = (needed[0], needed[-1]) if needed else (0, 0)
         begin, end = (self._begin + 3 * width * y for y in (first, last))
@@ -108,30 +114,11 @@ class _BatchMemory:
         if self._masks is not None:
             parts.append((self._end, len(self._host)))
         for begin, end in parts:
-            self._device[begin:end].copy_(self._host[begin:end], non_blocking=True)
+            self._on_device[begin:end].copy_(self._host[begin:end], non_blocking=True)
 
     def batch(self, indices: list[int], ranges: TileRanges | None) -> Batch:
         """Return the batch that was assembled in this memory."""
         return Batch(indices, self._views, self._targets, self._masks, self._samples, ranges)
-
-
-class _Slot:
-    """The memory of one batch; on CUDA later batches use it again."""
-
-    def __init__(self, device: torch.device) -> None:
-        self._device = device
-        self._memory: _BatchMemory | None = None
-        if device.type == "cuda":
-            # After the upload of the newest batch, and after all work that reads it.
-            self.uploaded, self.consumed = torch.cuda.Event(), torch.cuda.Event()
-
-    def reserve(self, shape: tuple[int, int, int, bool]) -> _BatchMemory:
-        """Return memory for a batch of this shape."""
-        if self._device.type != "cuda":
-            return _BatchMemory(shape, self._device)
-        if self._memory is None or self._memory.shape != shape:
-            self._memory = _BatchMemory(shape, self._device)
-        return self._memory
 
 
 class BatchLoader:
@@ -279,12 +266,12 @@ class BatchLoader:
             if self._owners is None:
                 raise
             self.lost = self.lost or str(error)
-            return _Photograph(None, torch.zeros(size[::-1], dtype=torch.uint8), 3.0 * math.prod(size))
+            return None, torch.zeros(size[::-1], dtype=torch.uint8), 3.0 * math.prod(size)
         if (index, reduction) not in self._sample_counts:
             counted = math.prod(size) if mask is None else int((mask != 0).sum())
             self._masked.setdefault(index, counted < (1.0 - MAX_MASKED) * math.prod(size))
             self._sample_counts[index, reduction] = float(max(1, 3 * counted))
-        return _Photograph(strip, mask, self._sample_counts[index, reduction])
+        return strip, mask, self._sample_counts[index, reduction]
 
     def _fill(self, slot: _Slot, plan: _Plan, photographs: list[_Photograph]) -> Batch:
         indices, ranges, rows, reduction = plan
@@ -293,19 +280,19 @@ class BatchLoader:
         if self._stream is not None:
             slot.uploaded.synchronize()  # returns at once: this upload ended long ago
             self._stream.wait_event(slot.consumed)
-        memory = slot.reserve((count, height, width, any(mask is not None for mask in masks)))
+        slot.reserve((count, height, width, any(mask is not None for mask in masks)))
         for view, (strip, (y0, y1)) in enumerate(zip(strips, rows, strict=True)):
             if strip is not None:
-                memory.pixels[view, y0:y1] = strip
-        if memory.included is not None:
-            for place, mask in zip(memory.included, masks, strict=True):
+                slot.pixels[view, y0:y1] = strip
+        if slot.included is not None:
+            for place, mask in zip(slot.included, masks, strict=True):
                 place[...] = 1 if mask is None else mask.numpy()
-        self._views.write(indices, memory.numbers[:-count], reduction)
-        memory.numbers[-count:] = samples
-        memory.upload(rows)
+        self._views.write(indices, slot.numbers[:-count], reduction)
+        slot.numbers[-count:] = samples
+        slot.upload(rows)
         if self._stream is not None:
             slot.uploaded.record(self._stream)
-        return memory.batch(indices, ranges)
+        return slot.batch(indices, ranges)
 
 
 def _aligned(size: int) -> int:

@@ -105,11 +105,9 @@ class Exposures:
         return {SHARED_EXPOSURES: torch.cat([self.measured.flatten(1), self.counts[:, None]], dim=1)}
 
     def restore(self, columns: Mapping[str, Tensor]) -> None:
-        """Restore the state from `columns`; those of other training views are ignored."""
-        found = columns.get(SHARED_EXPOSURES)
-        if found is not None and len(found) == len(self.counts):
-            found = found.to(self.measured.device)
-            self.measured, self.counts = found[:, :-1].reshape(-1, 2, 3).clone(), found[:, -1].clone()
+        """Restore the state from `columns` of the same training views."""
+        found = columns[SHARED_EXPOSURES].to(self.measured.device)
+        self.measured, self.counts = found[:, :-1].reshape(-1, 2, 3).clone(), found[:, -1].clone()
 
     def write(self, folder: Path, names: Sequence[str]) -> None:
         """Write `effective` into the folder of a run, by the names of the training views."""

@@ -58,14 +58,14 @@ def describe(report: dict[str, Any]) -> str:
 
 
 def run_figures(state: TrainingState, population: dict[str, Any]) -> dict[str, Any]:
-    """Return the figures of a run for its summary, besides its metrics. Collective."""
+    """Return the figures of a run for its summary, besides its metrics and the `population_report`."""
     figures = {
         "images": state.images_seen,
         "seconds": state.progress.seconds,
         "stages": state.stages(),
         "images_per_second": state.images_seen / max(state.progress.seconds, 1e-9),
-        "gaussians": state.population(),
-        "peak_gaussians": state.progress.peak_gaussians,
+        "gaussians": population["final"],
+        "peak_gaussians": population["peak"],
         "population": population,
         "peak_memory_bytes": peak_memory_bytes(state.ranks.device),
         "config_hash": config_hash(state.config),

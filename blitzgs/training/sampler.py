@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Hashable, Sequence
 from functools import lru_cache
 
@@ -73,7 +74,7 @@ class BatchSampler:
             first, batches = self._round = self._batches_before(index), self._batches_of(index)
         group, batch = batches[step - first]
         begin = batch * self.batch_size
-        return [self._view(group, position) for position in range(begin, begin + self.batch_size)]
+        return [self._at(group, position)[2] for position in range(begin, begin + self.batch_size)]
 
     def reduction(self, step: int) -> int:
         """Return by which factor the photographs of a step (0-based) are reduced."""
@@ -87,13 +88,7 @@ class BatchSampler:
 
     def _round_of(self, step: int) -> int:
         """Find the last round that starts at or before `step` and is not empty."""
-        low, high = 0, 1
-        while self._batches_before(high) <= step:
-            low, high = high, 2 * high
-        while high - low > 1:
-            middle = (low + high) // 2
-            low, high = (middle, high) if self._batches_before(middle) <= step else (low, middle)
-        return low
+        return bisect_right(range(1 << 60), step, key=self._batches_before) - 1
 
     def _make_round(self, index: int) -> list[tuple[int, int]]:
         """List the batches of a round in their order: group, and number within the group."""
@@ -103,7 +98,7 @@ class BatchSampler:
             for k in range(self._group_batches(count, index), self._group_batches(count, index + 1))
         ]
         if self._places is not None:
-            return sorted(slots, key=lambda slot: self._time(slot[0], slot[1] * self.batch_size))
+            return sorted(slots, key=lambda slot: self._at(slot[0], slot[1] * self.batch_size)[:2])
         order = hash_keys(torch.arange(len(slots)), self._seed, index, 1).argsort()
         return [slots[position] for position in order.tolist()]
 
@@ -121,14 +116,11 @@ class BatchSampler:
         order = keys.argsort(stable=True)
         return views[order].tolist(), keys[order].tolist()
 
-    def _time(self, group: int, position: int) -> tuple[int, float]:
-        """Return when the view at a position of a group's sequence comes: its epoch and its key there."""
+    def _at(self, group: int, position: int) -> tuple[int, float, int]:
+        """Return what is at a position of a group's sequence: its epoch, its key there, and the view."""
         epoch, slot = divmod(position, self._counts[group])
-        return epoch, self._epoch(group, epoch)[1][slot]
-
-    def _view(self, group: int, position: int) -> int:
-        epoch, slot = divmod(position, self._counts[group])
-        return self._epoch(group, epoch)[0][slot]
+        views, keys = self._epoch(group, epoch)
+        return epoch, keys[slot], views[slot]
 
 
 def tour_of(cameras: Sequence[Camera], points: Float64) -> list[int]:

@@ -43,7 +43,7 @@ from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
 from blitzgs.training.sampler import BatchSampler, tour_of
 from blitzgs.training.state import Curve, TrainingState
 from blitzgs.training.step import Stepper
-from blitzgs.training.view_level import keep_to_views
+from blitzgs.training.view_level import forget_views
 from blitzgs.view.levels import measure_levels
 from blitzgs.view.views import Space, ViewSet, trained_centres
 
@@ -84,7 +84,11 @@ def set_up(
     lap("checks")
     home = torch.device("cpu") if config.memory.resident_gb > 0 else ranks.device
     restored = restore(folder, ranks, home) if resume else None
-    config = _continued(_resolved(config, capture, restored), restored, extend, folder)
+    # Photographs may be lost or found again after a checkpoint (`data.allow_missing`). What it has by the
+    # index of a training view would then belong to other views.
+    train_views = train_views_fingerprint(capture)
+    same_views = restored is None or restored.progress.train_views in ("", train_views)
+    config = _continued(_resolved(config, capture, restored, same_views), restored, extend, folder)
     schedule = Schedule(config.schedule)
     if restored is None:
         table, progress = first_gaussians(config, capture, space, ranks, home)
@@ -94,17 +98,26 @@ def set_up(
         if ranks.rank == 0:
             warn_of_changes(folder, capture)
     lap("gaussians")
-    # The views and the spawn gate are compared with those of the checkpoint.
-    progress = keep_to_views(table, progress, capture, ranks)
-    veto, spawn_gate_digest = open_spawn_gate(config, capture, ranks, progress.gate)
-    progress = replace(progress, gate=spawn_gate_digest)
+    if not same_views:
+        forget_views(table, progress, capture, ranks)
+    progress.train_views = train_views
+    # The spawn gate is compared with that of the checkpoint.
+    veto, progress.gate = open_spawn_gate(config, capture, ranks, progress.gate)
     check_room(folder, table, ranks, config.population.max_gaussians)
 
     run_id = restored.run_id if restored is not None else ranks.broadcast_object(secrets.token_hex(4))
     if ranks.rank == 0:
-        _describe(folder, config, capture, run_id, is_new=restored is None)
+        save_config(config, folder / run_files.CONFIG)
+        if restored is None or not (folder / run_files.CAMERAS).exists():
+            save_cameras(folder, capture, run_id)
+        if restored is None and capture.about.frame is not None:
+            save_world_frame(folder, capture.about.frame)
     optimiser = TableAdam(config.optimiser, schedule, space.extent, ranks.device)
-    owners = _tile_owners(ranks, progress, restored)
+    # Tensors that are the same on all ranks: costs of tiles, and exposures.
+    shared = {} if restored is None or not same_views else restored.shared
+    owners = TileOwners(ranks)
+    if "bounds" in shared and ranks.world_size > 1:
+        owners.restore(shared)
     views = ViewSet(list(capture.cameras), space, ranks.device)
     sampler = _sampler(config, capture, schedule)
     if config.memory.resident_gb > 0:
@@ -114,7 +127,7 @@ def set_up(
     upcoming = UpcomingCameras(sampler, capture.train, views)
     stepper = _stepper(config, table, optimiser, owners, space.extent, upcoming)
     if config.model.exposure:
-        stepper.exposures = _exposures(capture, images, ranks, progress, restored)
+        stepper.exposures = _exposures(capture, images, ranks, restored, same_views)
     lineage = _start_lineage(config, capture, folder, table, progress, ranks)
     lap("table")
     return TrainingState(
@@ -142,15 +155,7 @@ def set_up(
     )
 
 
-def _describe(folder: Path, config: Config, capture: Capture, run_id: str, is_new: bool) -> None:
-    save_config(config, folder / run_files.CONFIG)
-    if is_new or not (folder / run_files.CAMERAS).exists():
-        save_cameras(folder, capture, run_id)
-    if is_new and capture.about.frame is not None:
-        save_world_frame(folder, capture.about.frame)
-
-
-def _resolved(config: Config, capture: Capture, restored: TrainedModel | None) -> Config:
+def _resolved(config: Config, capture: Capture, restored: TrainedModel | None, same_views: bool) -> Config:
     """Return `config` with the values that depend on the training views and on what the run has measured.
 
     The depths of what the views see decide on the near plane (`model.near`). The number of views decides the
@@ -159,8 +164,8 @@ def _resolved(config: Config, capture: Capture, restored: TrainedModel | None) -
     `with_pace_of` says what a run measures.
     """
     saved = None if restored is None else restored.config
-    if restored is not None and restored.progress.train_views not in ("", train_views_fingerprint(capture)):
-        config = decided_as(restored.config, config)
+    if saved is not None and not same_views:
+        config = decided_as(saved, config)
     model, views = config.model, len(capture.train)
     if model.near == 0:
         # Relative to the extent of this capture: a photograph that is lost later does not move the plane.
@@ -182,31 +187,19 @@ def _continued(config: Config, restored: TrainedModel | None, extend: float | No
     return config if extend is None else extended(config, restored.progress.step, extend)
 
 
-def _tile_owners(ranks: Ranks, progress: Progress, restored: TrainedModel | None) -> TileOwners:
-    """Return the division of tiles, with the costs that the checkpoint has if they can be used."""
-    owners = TileOwners(ranks)
-    if restored is None or "bounds" not in restored.shared or ranks.world_size == 1:
-        return owners
-    # Tile costs and plans are stored by view index. With other views, they would belong to other images.
-    if restored.progress.train_views in ("", progress.train_views):
-        owners.restore(restored.shared)
-    return owners
-
-
 def _exposures(
     capture: Capture,
     images: ImageStore,
     ranks: Ranks,
-    progress: Progress,
     restored: TrainedModel | None,
+    same_views: bool,
 ) -> Exposures | None:
     """Return the photographs' exposures, from the checkpoint or the tracks; None if they are equal."""
     exposures = Exposures(capture.train, ranks)
     if restored is not None:
         if SHARED_EXPOSURES not in restored.shared:
             return None
-        # As with the tiles, rows are those of the same training views.
-        if restored.progress.train_views in ("", progress.train_views):
+        if same_views:
             exposures.restore(restored.shared)
             return exposures
     gains = track_gains(capture, images, ranks)

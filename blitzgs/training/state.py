@@ -6,7 +6,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -176,7 +176,7 @@ class TrainingState:
     def add_stage(self, name: str, seconds: float) -> None:
         """Add seconds to a kind of work in `progress.stages`."""
         stages = self.progress.stages
-        self.progress = replace(self.progress, stages=stages | {name: stages.get(name, 0.0) + seconds})
+        stages[name] = stages.get(name, 0.0) + seconds
 
     def stages(self) -> dict[str, float]:
         """Return the seconds of each kind of work; "steps" is the training time that no other kind has."""

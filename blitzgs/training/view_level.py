@@ -6,7 +6,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from blitzgs.capture.capture import Capture, train_views_fingerprint
+from blitzgs.capture.capture import Capture
 from blitzgs.config.schedule import Event
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs.trained_model import Progress
@@ -32,7 +32,7 @@ def follow_schedule(state: TrainingState, begin: int) -> None:
     if view.footprint > 0 and (opens or state.schedule.has_new_levels(begin)):
         follow_footprints(state)
     if opens or not state.progress.gated_views:
-        state.progress = dataclasses.replace(state.progress, finest_level=state.progress.level_count - 1)
+        state.progress.finest_level = state.progress.level_count - 1
         choose_views(state)
 
 
@@ -46,7 +46,7 @@ def follow_footprints(state: TrainingState) -> None:
     table["level"] = footprint_levels(
         sizes, focal / config.view.footprint, state.progress.reference_distance, level_fork(config)
     )
-    state.progress = dataclasses.replace(state.progress, level_count=FOOTPRINT_LEVELS)
+    state.progress.level_count = FOOTPRINT_LEVELS
     state.stepper.reindex()
 
 
@@ -66,8 +66,8 @@ def choose_views(state: TrainingState) -> None:
     assert gate is not None  # the gate is open
     kept = gate.kept(state.views.centres(state.capture.train))
     gated = [gate.applies(share) for share in kept]
-    flags = "".join("1" if has_gate else "0" for has_gate in gated)
-    state.progress = dataclasses.replace(state.progress, gated_views=flags, least_kept=min(kept, default=0.0))
+    state.progress.gated_views = "".join("1" if has_gate else "0" for has_gate in gated)
+    state.progress.least_kept = min(kept, default=0.0)
     mean = sum(share if has_gate else 1.0 for share, has_gate in zip(kept, gated, strict=True)) / len(kept)
     values = {"finest_level": state.progress.finest_level, "gated_views": sum(gated), "kept": mean}
     text = (
@@ -78,24 +78,19 @@ def choose_views(state: TrainingState) -> None:
     state.log.event(state.images_seen, "lod_gate", values, text)
 
 
-def keep_to_views(table: GaussianTable, progress: Progress, capture: Capture, ranks: Ranks) -> Progress:
-    """Return the progress of a resumed run whose training views may have changed since the checkpoint.
+def forget_views(table: GaussianTable, progress: Progress, capture: Capture, ranks: Ranks) -> None:
+    """Drop what table and progress have by the index of a training view.
 
-    Photographs may be lost, or be found again, between a checkpoint and the run that continues from it
-    (`data.allow_missing`). Data that are stored by view index would then belong to other views. They are
-    dropped from the progress and from the table, and the gated views are chosen again before the next step.
+    The gated views are chosen again before the next step.
     """
-    views = train_views_fingerprint(capture)
-    if progress.train_views not in ("", views):
-        progress = dataclasses.replace(progress, gated_views="")
-        if CULL in table:
-            del table[CULL]
-            if ranks.rank == 0:
-                warn(
-                    f"the checkpoint was trained on other views than the {len(capture.train)} of today: the "
-                    "cull mask is dropped, and comes back with the next importance pass, if there is one"
-                )
-    return dataclasses.replace(progress, train_views=views)
+    progress.gated_views = ""
+    if CULL in table:
+        del table[CULL]
+        if ranks.rank == 0:
+            warn(
+                f"the checkpoint was trained on other views than the {len(capture.train)} of today: the cull "
+                "mask is dropped, and comes back with the next importance pass, if there is one"
+            )
 
 
 def batch_gate(state: TrainingState, indices: list[int]) -> ViewGate | None:

@@ -4,14 +4,13 @@
 import itertools
 import math
 import random
-import re
 from dataclasses import replace
 
 import pytest
 import torch
 
 from blitzgs.config.fields import OptimiserConfig, ScheduleConfig
-from blitzgs.config.files import ConfigError, from_dict, load_config, save_config, to_dict
+from blitzgs.config.files import from_dict, load_config, save_config, to_dict
 from blitzgs.config.schedule import Pace, Schedule, stretched
 from blitzgs.optim.table_adam import BETA1, BETA2, EPS, TableAdam
 from tests.training.tiny import random_gaussians
@@ -26,13 +25,17 @@ def all_events(config):
     return schedule, steps
 
 
+def density_events(schedule):
+    """Return the times of all density events."""
+    return [event.time for event in schedule.events(0, schedule.iterations) if event.kind == "densify"]
+
+
 def test_paper_schedule_densifies_thirty_times_and_last_at_31000():
     config = ScheduleConfig(
         iterations=90_000, batch_size=4, densify_from=2_000, densify_until=32_000, densify_every=1_000
     )
     schedule, steps = all_events(config)
-    times = [event.time for step in steps for event in step if event.kind == "densify"]
-    assert times == list(range(2_000, 32_000, 1_000))
+    assert density_events(schedule) == list(range(2_000, 32_000, 1_000))
     assert schedule.steps == 22_500
     for step, events in enumerate(steps):
         assert all(4 * step <= event.time < 4 * step + 4 for event in events)
@@ -43,10 +46,8 @@ def test_one_field_scales_every_time(scale):
     config = ScheduleConfig(
         iterations=3_000, densify_from=50, densify_until=1_500, densify_every=10, scale=scale
     )
-    schedule, steps = all_events(config)
-    times = [event.time for step in steps for event in step if event.kind == "densify"]
-    expected = sorted({math.floor(t * scale + 1e-6) for t in range(50, 1_500, 10)})
-    assert times == expected
+    schedule = Schedule(config)
+    assert density_events(schedule) == sorted({math.floor(t * scale + 1e-6) for t in range(50, 1_500, 10)})
     assert schedule.steps == math.floor(3_000 * scale + 1e-6)
 
 
@@ -58,21 +59,6 @@ def test_the_resolution_rises_at_its_times(scale):
         expected = 4 if begin < 100 * scale else 2 if begin < math.floor(902 * scale + 1e-6) else 1
         assert schedule.reduction(begin) == expected
     assert Schedule(ScheduleConfig()).reduction(0) == 1
-
-
-@pytest.mark.parametrize(
-    ("value", "message"),
-    [
-        ("[[3, 100]]", "factors must be 8, 4 or 2 and decrease, got [3]"),
-        ("[[2, 100], [4, 200]]", "factors must be 8, 4 or 2 and decrease, got [2, 4]"),
-        ("[[4, 200], [2, 200]]", "times must increase, got [200, 200]"),
-        ("[[2, 0]]", "must be in [1, 1,000,000,000], got ((2, 0),)"),
-        ("[2, 100]", "[0]: must be a list of 2 values, got 2"),
-    ],
-)
-def test_a_resolution_that_cannot_be_is_refused(value, message):
-    with pytest.raises(ConfigError, match=r"schedule\.resolution.*" + re.escape(message)):
-        load_config(None, [f"schedule.resolution={value}"])
 
 
 @pytest.mark.parametrize(
@@ -165,7 +151,7 @@ def test_opacities_are_reset_while_densifying_and_after_the_density_event_of_the
 def test_the_last_density_event_is_known(scale, until):
     config = ScheduleConfig(scale=scale, iterations=3_000, densify_until=until, densify_every=100)
     schedule = Schedule(config)
-    times = [event.time for event in schedule.events(0, schedule.iterations) if event.kind == "densify"]
+    times = density_events(schedule)
     assert [schedule.is_last_density_event(time) for time in times] == [*[False] * (len(times) - 1), True]
 
 
@@ -225,7 +211,7 @@ def test_a_change_of_pace_does_not_change_past_events():
         assert kinds.count("pass_1") == kinds.count("pass_2") == 1
         # Two events at one image become one; no other event is lost.
         wanted = {math.floor(schedule.pace.image(time) + 1e-6) for time in range(50, 1_500, 40)}
-        assert [event.time for event in happened if event.kind == "densify"] == sorted(wanted)
+        assert density_events(schedule) == sorted(wanted)
 
 
 def test_rates_follow_the_configurations_own_times():
@@ -294,24 +280,6 @@ def test_pace_is_read_and_written(tmp_path):
     assert config.schedule.pace == ((16, 0.25), (40, 3.0))
     save_config(config, tmp_path / "config.yaml")
     assert load_config(tmp_path / "config.yaml") == config == from_dict(to_dict(config))
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["schedule.pace=[[16, 1], [16, 2]]"], r"schedule.pace: .* above 0 and increase, got \[16, 16\]"),
-        (["schedule.pace=[[16, 1e5]]"], r"schedule.pace: its factors must be in .*, got 100000.0"),
-        (["schedule.pace=[[0, 1]]"], r"schedule.pace: must be in .*, got \(\(0, 1.0\),\)"),
-        (["schedule.pace=[[16]]"], r"schedule.pace\[0\]: must be a list of 2 values, got \[16\]"),
-        (["schedule.pace=[[1.5, 2]]"], r"schedule.pace\[0\]\[0\]: must be an integer, got 1.5"),
-        (["schedule.pace=[[16, 9e3]]"], r"times schedule.scale must be at most 10,000,000 images"),
-        (["schedule.minutes=-1"], r"schedule.minutes: must be in \[0, 1,000,000\], got -1.0"),
-        (["schedule.minutes=3", "schedule.scale=0.5"], r"schedule.scale: must be 1 .*--minutes.* got 0.5"),
-    ],
-)
-def test_impossible_paces_and_budgets_are_refused(overrides, message):
-    with pytest.raises(ConfigError, match=message):
-        load_config(None, overrides)
 
 
 def test_every_piece_of_the_final_drift_has_its_own_step_numbers():

@@ -9,22 +9,15 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import run_files, trained_model
-from blitzgs.training.events import densify
-from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
-from tests.distributed.test_training import require_agreement
+from tests.distributed.test_training import require_agreement, train_on
 from tests.helpers import needs_cuda
-from tests.training.tiny import events_of, tiny_config, tiny_scene
+from tests.training.tiny import assert_same_table, events_of
 
-# 30 steps of 2 images, with a checkpoint after 10, and density events after 28, 36, 44 and 52 images.
-SETTINGS = (
-    "schedule.iterations=60", "schedule.batch_size=2", "schedule.densify_from=28",
-    "schedule.densify_until=60", "schedule.densify_every=8", "schedule.size_prune_after=0",
-    "schedule.checkpoint_every=19", "population.grad_threshold=4e-3", "population.clone_scale=0.02",
-    "population.min_opacity=0.06", "model.antialiased=true", "optimiser.opacity=0.1",
-    "optimiser.position_noise=1e6", "log.every=2", "log.keep_checkpoints=9",
+RELOCATION = (
+    "population.strategy=relocation", "population.max_gaussians=450", "population.min_opacity=0.06",
+    "loss.opacity=0.01", "model.antialiased=true", "optimiser.opacity=0.1", "optimiser.position_noise=1e6",
 )  # fmt: skip
-RELOCATION = ("population.strategy=relocation", "loss.opacity=0.01", "population.max_gaussians=450")
 # The second importance pass at the end of density control keeps half. Then rates fall.
 PRUNED = (
     "population.importance=true", "population.score=weight", "population.pass2_mass=1",
@@ -35,17 +28,11 @@ OPTIONS = {"relocation": RELOCATION, "relocation, pruned": (*RELOCATION, *PRUNED
 FIRST = Path("checkpoints") / "checkpoint_000000"
 
 
-def _train(ranks, folder, *overrides):
-    torch.set_num_threads(1)
-    densify.MAX_IMBALANCE = 1.02  # so that ranks of a few hundred Gaussians are redistributed
-    Trainer(tiny_config(*SETTINGS, *overrides), *tiny_scene(), folder, ranks, resume=True).train()
-
-
 @pytest.fixture(scope="module", params=OPTIONS)
 def whole(request, tmp_path_factory):
     """A run on one rank: the options, its folder, and a folder that has its first checkpoint alone."""
     folder, base = tmp_path_factory.mktemp("whole"), tmp_path_factory.mktemp("base")
-    _train(Ranks(), folder, *OPTIONS[request.param])
+    train_on(Ranks(), folder, *OPTIONS[request.param])
     shutil.copytree(folder / FIRST, base / FIRST)
     return OPTIONS[request.param], folder, base
 
@@ -53,10 +40,9 @@ def whole(request, tmp_path_factory):
 def test_a_resumed_run_is_the_same(whole, tmp_path):
     options, folder, base = whole
     shutil.copytree(base, tmp_path / "run")
-    _train(Ranks(), tmp_path / "run", *options)
+    train_on(Ranks(), tmp_path / "run", *options)
     resumed, expected = (trained_model.restore(f, Ranks()).table for f in (tmp_path / "run", folder))
-    for name in expected:
-        assert torch.equal(resumed[name], expected[name]), name
+    assert_same_table(resumed, expected)
 
 
 @pytest.mark.cuda
@@ -64,12 +50,11 @@ def test_a_resumed_run_is_the_same(whole, tmp_path):
 @pytest.mark.parametrize("name", OPTIONS)
 def test_cuda_trains_with_each_option_and_resumes_exactly(name, tmp_path):
     ranks, options = Ranks(device=torch.device("cuda")), (*OPTIONS[name], "model.deterministic=true")
-    _train(ranks, tmp_path / "whole", *options)
+    train_on(ranks, tmp_path / "whole", *options)
     shutil.copytree(tmp_path / "whole" / FIRST, tmp_path / "run" / FIRST)
-    _train(ranks, tmp_path / "run", *options)
+    train_on(ranks, tmp_path / "run", *options)
     resumed, expected = (trained_model.restore(tmp_path / f, Ranks()).table for f in ("run", "whole"))
-    for column in expected:
-        assert torch.equal(resumed[column], expected[column]), column
+    assert_same_table(resumed, expected)
     events = events_of(tmp_path / "whole", "densify")
     assert sum(event["cloned"] for event in events) > 30
 
@@ -77,7 +62,7 @@ def test_cuda_trains_with_each_option_and_resumes_exactly(name, tmp_path):
 def test_two_ranks_agree_with_one(whole, tmp_path):
     options, folder, base = whole
     shutil.copytree(base, tmp_path / "run")
-    run_ranks(_train, 2, tmp_path / "run", *options)
+    run_ranks(train_on, 2, tmp_path / "run", *options)
     counts = ("t", "cloned", "split", "pruned", "relocated", "held_back", "gaussians")
     events = require_agreement(tmp_path / "run", folder, counts)
     assert sum(event["cloned"] for event in events) > 30
@@ -107,7 +92,7 @@ def test_births_less_deaths_are_the_living(whole, tmp_path):
     from blitzgs.spawn.lineage_parts import read_lineage
 
     options, _, _ = whole
-    _train(Ranks(), tmp_path, "population.lineage=true", *options)
+    train_on(Ranks(), tmp_path, "population.lineage=true", *options)
     log = read_lineage(tmp_path / run_files.LINEAGE)
     relocated = log["deaths"]["id"][log["deaths"]["cause"] == Cause.RELOCATED]
     living = set(log["births"]["id"].tolist()) - set(log["deaths"]["id"].tolist())

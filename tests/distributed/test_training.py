@@ -15,12 +15,25 @@ import numpy as np
 import pytest
 import torch
 
+from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import run_files, trained_model
 from blitzgs.training.events import densify
-from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import EIGHT, all_fail, on_each_device, run_ranks
-from tests.training.tiny import OVERRIDES, as_flags, events_of, read_log, steps_of, tiny_config, tiny_scene
+from tests.training.tiny import (
+    OVERRIDES,
+    as_flags,
+    assert_same_table,
+    at_step,
+    events_of,
+    lose_view,
+    make_trainer,
+    read_log,
+    sorted_rows,
+    steps_of,
+    stop_at,
+    tiny_scene,
+)
 
 ROOT = Path(__file__).parents[2]
 # 10 + 20 steps of 2 images; density events (after 28, 36, 44 and 52 images) fall into the 20 steps.
@@ -32,19 +45,16 @@ SETTINGS = (
 )  # fmt: skip
 
 
-def _train(ranks, folder, *overrides):
+def train_on(ranks, folder, *overrides):
     torch.set_num_threads(1)
     densify.MAX_IMBALANCE = 1.02  # so that ranks of a few hundred Gaussians are redistributed
-    capture, images = tiny_scene()
-    trainer = Trainer(tiny_config(*SETTINGS, *overrides), capture, images, folder, ranks, resume=True)
+    trainer = make_trainer(folder, *SETTINGS, *overrides, ranks=ranks, resume=True)
     summary = trainer.train()
     return summary, trainer.state.table["id"].cpu()
 
 
 def sorted_table(folder):
-    table = trained_model.restore(folder, Ranks()).table
-    order = table["id"].argsort()
-    return {name: table[name][order] for name in table}
+    return sorted_rows(trained_model.restore(folder, Ranks()).table)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +64,7 @@ def start(tmp_path_factory):
     @functools.cache
     def make(device):
         folder = tmp_path_factory.mktemp("start")
-        _train(Ranks(device=torch.device(device)), folder)
+        train_on(Ranks(device=torch.device(device)), folder)
         base = tmp_path_factory.mktemp("base")
         checkpoint = Path("checkpoints") / "checkpoint_000000"
         shutil.copytree(folder / checkpoint, base / checkpoint)
@@ -87,7 +97,7 @@ def test_twenty_steps_agree_with_one_rank(start, tmp_path, world_size, device):
     whole, base = start(device)
     folder = tmp_path / "run"
     shutil.copytree(base, folder)
-    answers = run_ranks(_train, world_size, folder, device=device)
+    answers = run_ranks(train_on, world_size, folder, device=device)
     # On CUDA sums are added in no particular order, and Adam takes a whole step for a gradient that is only a
     # rounding error: two equal trainings on one GPU differ by 2e-4 to 3e-3 after 30 steps.
     limit = 1e-4 if device == "cuda" else 1e-5
@@ -107,12 +117,11 @@ def test_twenty_steps_agree_with_one_rank(start, tmp_path, world_size, device):
 
 
 def _train_with_rank_config(ranks, folder):
-    _train(ranks, folder, f"loss.ssim=0.{ranks.rank + 1}")
+    train_on(ranks, folder, f"loss.ssim=0.{ranks.rank + 1}")
 
 
 def _resume_on_one_rank(ranks, folder):
-    capture, images = tiny_scene()
-    Trainer(tiny_config(*SETTINGS), capture, images, folder, ranks, resume=ranks.rank == 1)
+    make_trainer(folder, *SETTINGS, ranks=ranks, resume=ranks.rank == 1)
 
 
 @pytest.mark.parametrize(
@@ -127,19 +136,9 @@ def test_what_the_ranks_disagree_on_is_named(tmp_path, run, text):
 
 
 def _lose_a_photograph(ranks, folder):
-    capture, images = tiny_scene()
-    trainer = Trainer(tiny_config(*SETTINGS), capture, images, folder, ranks)
-    step = trainer.step
-
-    def gone(index, factor=1):
-        raise FileNotFoundError(2, "No such file or directory", f"/photos/{index:02}.png")
-
-    def losing(number):
-        step(number)
-        if number == 15 and ranks.rank == 1:
-            images.get = gone
-
-    trainer.step = losing
+    trainer = make_trainer(folder, *SETTINGS, ranks=ranks)
+    if ranks.rank == 1:
+        at_step(pytest.MonkeyPatch(), 15, lambda _: trainer.state.images.lose())
     trainer.train()
 
 
@@ -147,28 +146,19 @@ LOST = r"PhotographError: .*{}.*put the photograph back and continue with --resu
 
 
 def test_a_photograph_lost_on_one_rank_is_named_by_all_and_costs_nothing(tmp_path):
-    all_fail(LOST.format("rank 1: .*/photos/0"), _lose_a_photograph, tmp_path)
+    all_fail(LOST.format("rank 1: /photos/0"), _lose_a_photograph, tmp_path)
     # The other rank is in the middle of the step: they save where they next agree. The last checkpoint of the
     # schedule is that after 19 images.
     assert trained_model.restore(tmp_path, Ranks()).progress.step == 16
-    for summary, _ in run_ranks(_train, 2, tmp_path):
+    for summary, _ in run_ranks(train_on, 2, tmp_path):
         assert summary["images"] == 60
 
 
 def _lose_the_last_photographs(ranks, folder):
-    capture, images = tiny_scene()
-    trainer = Trainer(tiny_config(*SETTINGS), capture, images, folder, ranks)
+    trainer = make_trainer(folder, *SETTINGS, ranks=ranks)
     trainer.loader._ahead = 0  # so that the last step reads its photographs itself
-    step, get = trainer.step, images.get
-
-    def losing(number):
-        images.get = gone if number == 30 and ranks.rank == 0 else get
-        step(number)
-
-    def gone(index, factor=1):
-        raise ValueError(f"/photos/{index:02}.png is damaged")
-
-    trainer.step = losing
+    if ranks.rank == 0:
+        at_step(pytest.MonkeyPatch(), 29, lambda _: trainer.state.images.lose(error=ValueError))
     trainer.train()
 
 
@@ -178,18 +168,12 @@ def test_a_photograph_lost_in_the_last_step_is_named_by_all(tmp_path):
 
 
 def _lose_a_held_out_photograph(ranks, folder, resume):
-    capture, images = tiny_scene()
-    capture.train, capture.test, get = [0, 2, 4, 6], [1, 3, 5, 7], images.get
-
-    def gone(index, factor=1):
-        if index == 5:
-            raise FileNotFoundError(2, "No such file or directory", "/photos/05.png")
-        return get(index)
-
+    capture, images = scene = tiny_scene()
+    capture.train, capture.test = [0, 2, 4, 6], [1, 3, 5, 7]
     if not resume:
-        images.get = gone
-    config = tiny_config(*SETTINGS, "schedule.evaluate_every=30")
-    return Trainer(config, capture, images, folder, ranks, resume).train()
+        images.lose(5)
+    options = (*SETTINGS, "schedule.evaluate_every=30")
+    return make_trainer(folder, *options, scene=scene, ranks=ranks, resume=resume).train()
 
 
 def test_a_held_out_photograph_lost_on_several_ranks_is_named_by_all_and_costs_nothing(tmp_path):
@@ -200,10 +184,10 @@ def test_a_held_out_photograph_lost_on_several_ranks_is_named_by_all_and_costs_n
 
 def _stop_in_an_evaluation(ranks, folder, every):
     """Ask the last rank to stop when it compares its first view; return when each rank compared a view."""
-    capture, images = tiny_scene()
+    capture, images = scene = tiny_scene()
     capture.test = capture.train * 6
-    config = tiny_config(*SETTINGS, f"schedule.evaluate_every={every}")
-    trainer = Trainer(config, capture, images, folder, ranks)
+    options = (*SETTINGS, f"schedule.evaluate_every={every}")
+    trainer = make_trainer(folder, *options, scene=scene, ranks=ranks)
     get, compared = images.get, []
 
     def stopping(index, factor=1):
@@ -227,26 +211,25 @@ def test_a_signal_within_an_evaluation_does_not_wait_for_its_end(tmp_path, world
     events = [record.get("event") for record in read_log(tmp_path)]
     assert "evaluation stopped" in events and "evaluation" not in events and events[-1] == "stopped"
     assert ("hint" in events) == (world_size > 1)  # a batch of 2 views
-    for summary, _ in run_ranks(_train, world_size, tmp_path, f"schedule.evaluate_every={every}"):
+    for summary, _ in run_ranks(train_on, world_size, tmp_path, f"schedule.evaluate_every={every}"):
         assert summary["images"] == 60 and "psnr" in summary
 
 
 def _resume_with_fewer_views(ranks, folder):
     """Train on views of two sizes, and go on from the first checkpoint without the first of them."""
-    capture, images = tiny_scene()
+    capture, images = scene = tiny_scene()
     for camera in capture.cameras[::2]:
         camera.width = 24
     images.images[::2] = [image[:, :24].contiguous() for image in images.images[::2]]
-    Trainer(tiny_config(*SETTINGS), capture, images, folder, ranks).train()
+    make_trainer(folder, *SETTINGS, scene=scene, ranks=ranks).train()
     if ranks.rank == 0:
         for later in sorted((folder / run_files.CHECKPOINTS).glob("checkpoint_*"))[1:]:
             shutil.rmtree(later)
     ranks.barrier()
     known = trained_model.restore(folder, ranks).shared["steps"].tolist()
-    del capture.cameras[0], images.images[0]
-    capture.train, capture.test = [0, 1, 3, 4, 5, 6], [2]
-    config = tiny_config(*SETTINGS, "data.allow_missing=true")
-    resumed = Trainer(config, capture, images, folder, ranks, resume=True)
+    lose_view(*scene, 0)
+    options = (*SETTINGS, "data.allow_missing=true")
+    resumed = make_trainer(folder, *options, scene=scene, ranks=ranks, resume=True)
     kept = resumed.state.owners.columns()
     return known, kept["views"].tolist(), kept["steps"].tolist(), resumed.train() is not None
 
@@ -259,22 +242,12 @@ def test_borders_of_views_that_are_lost_are_not_those_of_others(tmp_path):
 
 def _train_and_stop(rank, arguments, signalled_at):
     """`blitzgs train`; rank 1 alone is asked to stop after a step."""
-    from blitzgs.cli import main
-
-    step = Trainer.step
-
-    def stopping(self, number):
-        step(self, number)
-        if rank == 1 and number == signalled_at:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    Trainer.step = stopping
+    if rank == 1:
+        stop_at(pytest.MonkeyPatch(), signalled_at)
     return main(arguments)
 
 
 def _command(rank, arguments):
-    from blitzgs.cli import main
-
     return main(arguments)
 
 
@@ -328,9 +301,7 @@ def test_a_resume_on_as_many_ranks_repeats_every_bit(capture, trained, tmp_path)
     assert run_ranks(_train_and_stop, 2, flags, 12, join=False) == [0, 0]
     assert (tmp_path / "checkpoints" / "checkpoint_000000" / "shared.safetensors").exists()
     assert run_ranks(_command, 2, flags, join=False) == [0, 0]
-    got, want = sorted_table(tmp_path), sorted_table(trained)
-    for name in want:
-        assert torch.equal(got[name], want[name]), name
+    assert_same_table(sorted_table(tmp_path), sorted_table(trained))
     got, want = (trained_model.restore(folder, Ranks()).shared for folder in (tmp_path, trained))
     assert len(set(want["views"].tolist())) == 7 and sorted(got) == sorted(want)
     for name in want:

@@ -29,7 +29,6 @@ from blitzgs.frame.render import RenderOptions, render_frame
 from blitzgs.ops.projection_types import WeightedViews
 from blitzgs.runs import trained_model
 from blitzgs.table.table import PARAMETERS, GaussianTable
-from blitzgs.training.trainer import Trainer
 from blitzgs.view.views import Space, ViewSet
 from tests.distributed.rank_harness import CONTEXT
 from tests.helpers import needs_cuda
@@ -39,8 +38,8 @@ from tests.training.tiny import (
     Capture,
     Images,
     as_flags,
+    make_trainer,
     steps_of,
-    tiny_config,
     write_tiny_capture,
 )
 
@@ -278,12 +277,12 @@ def memory(device):
 
 
 def start_trainer(folder, device, steps):
-    capture, images = carpet_capture(device)
-    config = tiny_config(
+    options = (
         f"schedule.iterations={steps}", f"schedule.position_decay={steps}", "schedule.densify_from=0",
         "schedule.densify_until=0", f"log.every={steps // 10}", "log.checkpoint_seconds=0",
     )  # fmt: skip
-    trainer = Trainer(config, capture, images, folder, Ranks(device=torch.device(device)))
+    ranks = Ranks(device=torch.device(device))
+    trainer = make_trainer(folder, *options, scene=carpet_capture(device), ranks=ranks)
     table, unit = trainer.state.table, trainer.state.space.unit
     # The octree's Gaussians are round, so gradients of quaternions would be rounding errors, which Adam
     # magnifies.

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Batches: which views, and their photographs and masks although memory is reused."""
 
+import contextlib
 from collections import Counter
 from dataclasses import replace
 
@@ -11,7 +12,7 @@ import torch
 from blitzgs.config.fields import ScheduleConfig
 from blitzgs.config.schedule import Schedule
 from blitzgs.training.batches import BatchLoader
-from blitzgs.training.sampler import BatchSampler
+from blitzgs.training.sampler import BatchSampler, tour_of
 from blitzgs.view.views import Space, ViewSet
 from tests.helpers import DEVICES, look_at_origin, refused
 from tests.training.tiny import Camera, Images
@@ -36,31 +37,36 @@ def capture():
     return cameras, Images(images, masks)
 
 
-def make_loader(cameras, images, device, ahead, train=EVERY):
-    """A loader of batches of two views, its sampler, and the views."""
-    views = ViewSet(cameras, Space(offset=(0.0, 0.0, 0.0), unit=1.0, extent=1.0), device)
-    sampler = BatchSampler([SIZES[camera] for camera in train], 2, seed=3)
-    return BatchLoader(images, views, list(train), sampler, device, ahead), sampler, views
+@pytest.fixture
+def make_loader(capture):
+    """Make a loader of batches of two views; returns its sampler and the views, too."""
+    with contextlib.ExitStack() as loaders:
+
+        def make(device, ahead, train=EVERY):
+            views = ViewSet(capture[0], Space(offset=(0.0, 0.0, 0.0), unit=1.0, extent=1.0), device)
+            sampler = BatchSampler([SIZES[camera] for camera in train], 2, seed=3)
+            loader = BatchLoader(capture[1], views, list(train), sampler, device, ahead)
+            loaders.callback(loader.close)
+            return loader, sampler, views
+
+        yield make
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("ahead", [0, 1, 3])
-def test_each_step_gets_its_own_views(capture, device, ahead):
-    cameras, images = capture
+def test_each_step_gets_its_own_views(capture, make_loader, device, ahead):
+    _, images = capture
     device = torch.device(device)
     train = [7, 6, 5, 4, 3, 2, 1, 0]
-    loader, sampler, views = make_loader(cameras, images, device, ahead, train)
+    loader, sampler, views = make_loader(device, ahead, train)
     seen = []
-    try:
-        for step in range(STEPS):
-            batch = loader.get(step, STEPS)
-            if device.type == "cuda":
-                torch.cuda._sleep(1_000_000)  # a slow step, which the batches made ahead must not overtake
-            tensors = (batch.targets, batch.masks, batch.samples, batch.views.viewmats, batch.views.Ks)
-            copies = [None if tensor is None else tensor.clone() for tensor in tensors]
-            seen.append((batch.indices, batch.views.width, batch.views.height, *copies))
-    finally:
-        loader.close()
+    for step in range(STEPS):
+        batch = loader.get(step, STEPS)
+        if device.type == "cuda":
+            torch.cuda._sleep(1_000_000)  # a slow step, which the batches made ahead must not overtake
+        tensors = (batch.targets, batch.masks, batch.samples, batch.views.viewmats, batch.views.Ks)
+        copies = [None if tensor is None else tensor.clone() for tensor in tensors]
+        seen.append((batch.indices, batch.views.width, batch.views.height, *copies))
     for step, (indices, width, height, targets, masks, samples, viewmats, Ks) in enumerate(seen):
         assert indices == [train[view] for view in sampler.batch(step)]
         expected = views.pick(indices)
@@ -77,39 +83,35 @@ def test_each_step_gets_its_own_views(capture, device, ahead):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("ahead", [0, 3])
-def test_reduced_photographs_and_their_cameras(capture, device, ahead):
+def test_reduced_photographs_and_their_cameras(capture, make_loader, device, ahead):
     """Also where the resolution rises, and where the pace changes when later batches are prepared already."""
-    cameras, images = capture
-    loader, sampler, views = make_loader(cameras, images, torch.device(device), ahead)
+    _, images = capture
+    loader, sampler, views = make_loader(torch.device(device), ahead)
     config = ScheduleConfig(iterations=100, batch_size=2, resolution=((4, 8), (2, 30)))
     sampler.schedule, seen = Schedule(config), []
-    try:
-        for step in range(STEPS):
-            batch = loader.get(step, STEPS)
-            factor = 4 if step < 4 else 2 if step < 12 else 1
-            seen.append(factor)
-            expected = views.pick(batch.indices)
-            assert batch.indices == sampler.batch(step)
-            assert torch.equal(batch.views.viewmats, expected.viewmats)
-            assert torch.equal(
-                batch.views.Ks * torch.tensor([[factor], [factor], [1]], device=device), expected.Ks
-            )
-            width, height = SIZES[batch.indices[0]]
-            assert (batch.views.width, batch.views.height) == (width // factor, height // factor)
-            for view, index in enumerate(batch.indices):
-                photo, mask = images.get(index), images.mask(index)
-                if mask is None:
-                    mask = torch.ones(height, width, dtype=torch.uint8)
-                target, counted = by_squares(photo.numpy(), mask.numpy(), factor)
-                difference = batch.targets[view].cpu().numpy() - target
-                assert np.abs(difference[counted]).max() <= 0.5 + 1e-4
-                assert batch.samples[view] == 3 * counted.sum()
-                if batch.masks is not None:
-                    assert np.array_equal(batch.masks[view].cpu().numpy() != 0, counted)
-            if step == 10:  # the resolution now rises at image 24 and not 30; batch 13 may be prepared
-                sampler.schedule = Schedule(replace(config, pace=((22, 0.25),)))
-    finally:
-        loader.close()
+    for step in range(STEPS):
+        batch = loader.get(step, STEPS)
+        factor = 4 if step < 4 else 2 if step < 12 else 1
+        seen.append(factor)
+        expected = views.pick(batch.indices)
+        assert batch.indices == sampler.batch(step)
+        assert torch.equal(batch.views.viewmats, expected.viewmats)
+        factors = torch.tensor([[factor], [factor], [1]], device=device)
+        assert torch.equal(batch.views.Ks * factors, expected.Ks)
+        width, height = SIZES[batch.indices[0]]
+        assert (batch.views.width, batch.views.height) == (width // factor, height // factor)
+        for view, index in enumerate(batch.indices):
+            photo, mask = images.get(index), images.mask(index)
+            if mask is None:
+                mask = torch.ones(height, width, dtype=torch.uint8)
+            target, counted = by_squares(photo.numpy(), mask.numpy(), factor)
+            difference = batch.targets[view].cpu().numpy() - target
+            assert np.abs(difference[counted]).max() <= 0.5 + 1e-4
+            assert batch.samples[view] == 3 * counted.sum()
+            if batch.masks is not None:
+                assert np.array_equal(batch.masks[view].cpu().numpy() != 0, counted)
+        if step == 10:  # the resolution now rises at image 24 and not 30; batch 13 may be prepared
+            sampler.schedule = Schedule(replace(config, pace=((22, 0.25),)))
     assert set(seen) == {4, 2, 1} and loader.views_masked[1] == len(SIZES)
 
 
@@ -126,32 +128,33 @@ def by_squares(photo, mask, factor):
 
 
 @pytest.mark.parametrize(("batches", "first"), [(100, 11), (16, 9), (0, 3)])
-def test_photographs_are_decoded_before_their_batches_are_assembled(capture, batches, first, monkeypatch):
+def test_photographs_are_decoded_before_their_batches_are_assembled(
+    capture, make_loader, batches, first, monkeypatch
+):
     """Up to half of the memory for decoded images, and always those of the batches that are assembled."""
-    cameras, images = capture
+    _, images = capture
     wanted = []
     budget = batches * 2 * 4 * 48 * 32  # images and masks of batches of two views
     monkeypatch.setattr(images, "room", lambda: budget)
     monkeypatch.setattr(images, "prefetch", lambda indices, masks, factor: wanted.append((indices, masks)))
-    loader, sampler, _ = make_loader(cameras, images, torch.device("cpu"), ahead=2, train=range(5))
-    try:
-        loader.get(0, STEPS)
-        assert [indices for indices, _ in wanted] == [sampler.batch(step) for step in range(first)]
-        assert all(indices == masks for indices, masks in wanted)
-        for step in range(1, STEPS):
-            loader.get(step, STEPS)
-        each_once = sorted(sampler.batch(step) for step in range(STEPS))
-        assert sorted(indices for indices, _ in wanted) == each_once
-        assert loader.waited > 0
-    finally:
-        loader.close()
+    loader, sampler, _ = make_loader(torch.device("cpu"), ahead=2, train=range(5))
+    loader.get(0, STEPS)
+    assert [indices for indices, _ in wanted] == [sampler.batch(step) for step in range(first)]
+    assert all(indices == masks for indices, masks in wanted)
+    for step in range(1, STEPS):
+        loader.get(step, STEPS)
+    each_once = sorted(sampler.batch(step) for step in range(STEPS))
+    assert sorted(indices for indices, _ in wanted) == each_once
+    assert loader.waited > 0
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("ahead", [0, 2])
-def test_memory_is_used_once_though_an_image_could_not_be_read(capture, device, ahead, monkeypatch):
-    cameras, images = capture
-    loader, sampler, _ = make_loader(cameras, images, torch.device(device), ahead)
+def test_memory_is_used_once_though_an_image_could_not_be_read(
+    capture, make_loader, device, ahead, monkeypatch
+):
+    _, images = capture
+    loader, sampler, _ = make_loader(torch.device(device), ahead)
     fails, get = True, images.get
 
     def sometimes(index, factor):
@@ -160,29 +163,26 @@ def test_memory_is_used_once_though_an_image_could_not_be_read(capture, device, 
         return get(index)
 
     monkeypatch.setattr(images, "get", sometimes)
-    try:
-        step = 0
-        for _ in range(STEPS + 20):
-            try:
-                batch = loader.get(step, STEPS)
-            except OSError:
-                fails = False
-                continue
-            expected = torch.stack([get(index) for index in sampler.batch(step)])
-            assert torch.equal(batch.targets.cpu(), expected)
-            step += 1
-            if step == STEPS:
-                break
-    finally:
-        loader.close()
+    step = 0
+    for _ in range(STEPS + 20):
+        try:
+            batch = loader.get(step, STEPS)
+        except OSError:
+            fails = False
+            continue
+        expected = torch.stack([get(index) for index in sampler.batch(step)])
+        assert torch.equal(batch.targets.cpu(), expected)
+        step += 1
+        if step == STEPS:
+            break
     assert step == STEPS and not fails
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_memory_is_given_back_when_a_batch_cannot_be_assembled(capture, device, monkeypatch):
+def test_memory_is_given_back_when_a_batch_cannot_be_assembled(capture, make_loader, device, monkeypatch):
     """An image of another size than its camera's fails after memory for its batch was taken."""
-    cameras, images = capture
-    loader, sampler, _ = make_loader(cameras, images, torch.device(device), ahead=1)
+    _, images = capture
+    loader, sampler, _ = make_loader(torch.device(device), ahead=1)
     get, failures = images.get, 0
 
     def too_narrow(index, factor):
@@ -193,16 +193,13 @@ def test_memory_is_given_back_when_a_batch_cannot_be_assembled(capture, device, 
         return get(index)
 
     monkeypatch.setattr(images, "get", too_narrow)
-    try:
-        for _ in range(20):
-            try:
-                batch = loader.get(0, STEPS)
-                break
-            except ValueError as error:
-                assert "could not broadcast" in str(error)
-        assert torch.equal(batch.targets.cpu(), torch.stack([get(i) for i in sampler.batch(0)]))
-    finally:
-        loader.close()
+    for _ in range(20):
+        try:
+            batch = loader.get(0, STEPS)
+            break
+        except ValueError as error:
+            assert "could not broadcast" in str(error)
+    assert torch.equal(batch.targets.cpu(), torch.stack([get(i) for i in sampler.batch(0)]))
     assert failures == 10
 
 
@@ -285,3 +282,43 @@ def test_views_of_all_sizes_follow_a_tour_together():
 
 def test_a_tour_names_each_view_once():
     refused(ValueError, "the 50 views once, got 49", BatchSampler, [0] * 50, 2, seed=1, tour=list(range(49)))
+
+
+K = np.array([[60.0, 0.0, 32.0], [0.0, 60.0, 32.0], [0.0, 0.0, 1.0]])
+
+
+def oblique(place, azimuth, height=10.0):
+    """A camera at (x, y, height) that looks 45 degrees down, at a place `height` away."""
+    forward = np.array([np.cos(azimuth), np.sin(azimuth), -1.0]) / np.sqrt(2)
+    right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack((right, np.cross(forward, right), forward))
+    pose[:3, 3] = -pose[:3, :3] @ np.append(place, height)
+    return Camera("view", 64, 64, K, pose)
+
+
+def test_neighbours_of_a_tour_show_the_same_places():
+    """Four oblique cameras a place: those that show the same place are elsewhere, and look elsewhere."""
+    centres = [(x, y) for x in range(0, 80, 10) for y in range(0, 80, 10)]
+    azimuths = np.arange(4) * np.pi / 2
+    cameras = [oblique(centre, azimuth) for centre in centres for azimuth in azimuths]
+    shown = np.array([np.array(c) + 10 * np.array((np.cos(a), np.sin(a))) for c in centres for a in azimuths])
+    grid = np.arange(-20.0, 92.0, 1.5)
+    points = np.stack((*np.meshgrid(grid, grid), np.zeros((len(grid), len(grid)))), axis=-1).reshape(-1, 3)
+    order = tour_of(cameras, points)
+    assert sorted(order) == list(range(len(cameras)))
+
+    def step(places):
+        return float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1)))
+
+    random = np.random.default_rng(0).permutation(len(cameras))
+    # Neighbours show the same place or the next one, 10 away; along the flight it is 14.
+    assert step(shown[order]) < 10.1
+    assert step(shown) > 14.0
+    assert step(shown[random]) > 30.0
+
+
+def test_cameras_without_points_are_visited_by_their_own_places():
+    centres = np.random.default_rng(1).permutation(np.arange(16.0))
+    cameras = [oblique((x, 0.0), 0.0) for x in centres]
+    assert centres[tour_of(cameras, np.zeros((0, 3)))].tolist() == sorted(centres)

@@ -3,9 +3,7 @@
 
 import json
 import math
-import os
 import random
-import signal
 import warnings
 from dataclasses import replace
 from types import SimpleNamespace
@@ -28,7 +26,9 @@ from tests.helpers import refused
 from tests.training.tiny import (
     OVERRIDES,
     as_flags,
+    assert_same_table,
     events_of,
+    make_trainer,
     stop_at,
     tiny_config,
     tiny_scene,
@@ -133,7 +133,7 @@ def test_a_run_has_no_more_images_than_a_run_may_have():
 
 def start(folder, *overrides, resume=False, ranks=None, haste=1.0):
     """A trainer whose images take 10 ms, and longer the more Gaussians there are."""
-    trainer = Trainer(tiny_config(*BUDGET, *overrides), *tiny_scene(), folder, ranks or Ranks(), resume)
+    trainer = make_trainer(folder, *BUDGET, *overrides, ranks=ranks, resume=resume)
     state, now = trainer.state, [0.0]
     state.clock = lambda: now[0]
     step = trainer.step
@@ -146,16 +146,13 @@ def start(folder, *overrides, resume=False, ranks=None, haste=1.0):
     return trainer
 
 
-def stop_after(trainer, count):
-    step = trainer.step
-
-    def stopping(number):
-        step(number)
-        if number == count:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    trainer.step = stopping
-    assert trainer.train() is None
+def stopped(folder, number):
+    """A trainer that was stopped after step `number`."""
+    with pytest.MonkeyPatch.context() as patch:
+        stop_at(patch, number)
+        trainer = start(folder)
+        assert trainer.train() is None
+    return trainer
 
 
 @pytest.fixture(scope="module")
@@ -184,14 +181,12 @@ def test_the_saved_configuration_repeats_the_run_without_the_clock(timed_run, tm
     again = Trainer(config, *tiny_scene(), tmp_path, Ranks())
     repeated = again.train()
     assert repeated["psnr"] == summary["psnr"] and "budget_seconds" not in repeated
-    for name in again.state.table:
-        assert torch.equal(again.state.table[name], trainer.state.table[name]), name
+    assert_same_table(again.state.table, trainer.state.table)
 
 
 @pytest.mark.parametrize("stop", [2, 6, 70])
 def test_a_run_resumes_before_and_after_it_has_chosen_its_pace(tmp_path, stop):
-    first = start(tmp_path)
-    stop_after(first, stop)
+    first = stopped(tmp_path, stop)
     before = first.state.config.schedule.pace
     assert bool(before) == (stop > 8)
     with warnings.catch_warnings():
@@ -209,7 +204,7 @@ def test_a_run_resumes_before_and_after_it_has_chosen_its_pace(tmp_path, stop):
 
 
 def test_a_resumed_run_may_have_more_time_but_not_lose_its_budget(tmp_path):
-    stop_after(start(tmp_path), 70)
+    stopped(tmp_path, 70)
     with pytest.raises(ConfigError, match=r"schedule.minutes: the checkpoint was trained with 0.04, now 0"):
         start(tmp_path, "schedule.minutes=0", resume=True)
     summary = start(tmp_path, "schedule.minutes=0.06", resume=True).train()
@@ -282,8 +277,8 @@ def test_a_run_that_is_not_finished_is_not_extended():
     refused(ConfigError, "schedule", extended, tiny_config(), 100, 1e9)
 
 
-def extend(folder, by, *overrides):
-    config = load_config(folder / run_files.CONFIG, overrides)
+def extend(folder, by):
+    config = load_config(folder / run_files.CONFIG)
     return Trainer(config, *tiny_scene(), folder, Ranks(), resume=True, extend=by)
 
 
@@ -298,12 +293,11 @@ def test_an_interrupted_extension_ends_as_an_uninterrupted_one(tmp_path, monkeyp
                 stop_at(patch, 120)
                 assert extend(tmp_path / name, 1.4).train() is None
             refused(ConfigError, r"not finished \(120 of 140 images\)", extend, tmp_path / name, 2)
-            config = load_config(tmp_path / name / run_files.CONFIG)
-            running = Trainer(config, *tiny_scene(), tmp_path / name, Ranks(), resume=True)
+            running = extend(tmp_path / name, None)
         assert running.train()["images"] == 140
         tables.append(running.state.table)
         assert json.loads((tmp_path / name / "summary.json").read_text())["images"] == 140
-    assert all(torch.equal(tables[0][column], tables[1][column]) for column in tables[0])
+    assert_same_table(*tables)
 
 
 def test_an_extension_that_was_killed_before_its_first_checkpoint_can_be_repeated(tmp_path):
@@ -314,4 +308,4 @@ def test_an_extension_that_was_killed_before_its_first_checkpoint_can_be_repeate
 
 def test_there_must_be_a_run(tmp_path):
     with pytest.raises(FileNotFoundError, match="has no checkpoint: there is no finished run to extend"):
-        Trainer(tiny_config(), *tiny_scene(), tmp_path / "new", Ranks(), resume=True, extend=2.0)
+        Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks(), resume=True, extend=2.0)

@@ -3,6 +3,7 @@
 
 import json
 import math
+import shlex
 import shutil
 import struct
 import subprocess
@@ -20,8 +21,7 @@ from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply
 from blitzgs.runs import trained_model
-from blitzgs.training.sampler import tour_of
-from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, Camera, as_flags, events_of, write_tiny_capture
+from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, as_flags, events_of, write_tiny_capture
 
 ROOT = Path(__file__).parents[2]
 
@@ -44,8 +44,7 @@ def test_the_log_names_the_limit_of_the_population(trained, tmp_path, capsys, st
     limit = f"population.strategy={strategy}", f"population.max_gaussians={most}"
     flags = as_flags("config=defaults", *OVERRIDES, "schedule.iterations=22", "population.growth=0.5", *limit)
     assert main(["train", "--data", str(trained[0]), "--out", str(tmp_path / "r"), *flags]) == 0
-    lines = (tmp_path / "r" / "log.jsonl").read_text().splitlines()
-    event = next(record for record in map(json.loads, lines) if record.get("event") == "densify")
+    event = events_of(tmp_path / "r", "densify")[0]
     held_back, shown = event["held_back"], " ".join(capsys.readouterr().out.split())
     assert held_back > 0 and event["gaussians"] <= most
     assert f"population.max_gaussians limits the model to {most} Gaussians; this event would" in shown
@@ -96,79 +95,63 @@ def test_torchrun_entry(trained, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "status", "message"),
+    ("command", "status", "message"),
     [
-        (["train", "--out", "x"], 1, "data.path: no capture given; use --data DIR"),
-        (["train", "--out", "x", "--resume"], 1, "x holds no run to continue (it has no config.yaml): check"),
-        (["train", "--data", "/nowhere", "--out", "x"], 1, "/nowhere"),
-        (
-            ["train", "--data", "d", "--out", "x", "--loss.sim=1"],
-            1,
-            "loss.sim: unknown field; did you mean 'ssim'",
-        ),
-        (["train", "--data", "d", "--out", "x", "--loss.ssim"], 2, "--loss.ssim needs a value: write"),
-        (["train", "--data", "d", "--out", "x", "--loss.ssim", "--resume"], 2, "--loss.ssim needs a value"),
-        (
-            ["train", "--data", "d", "--out", "x", "--loss.ssim", "9"],
-            1,
-            "loss.ssim: must be in [0, 1], got 9",
-        ),
-        (["train", "--data", "d", "--out", "x", "5"], 2, "written --section.field=value"),
-        (["train", "--data", "d", "--out", "x", "--resum"], 2, "--resum; did you mean --resume?"),
-        (["train", "--data", "d", "--out", "x", "--minute=5"], 2, "--minute=5; did you mean --minutes?"),
-        (["eval", "x", "--dev=cpu"], 2, "--dev=cpu; did you mean --device?"),
-        (["eval", "x", "--pictures", "1", "--pictures=2"], 2, "--pictures is given twice"),
-        (["train", "--out", "x", "--out=y"], 2, "--out is given twice"),
-        (["train", "--out", "x", "--extend=2", "--minutes=3"], 2, "--extend and --minutes exclude"),
-        (["train", "--check", "--resume"], 2, "required: --data, --out"),
-        (["train", "--out", "x", "--seed=1", "--seed=2"], 2, "--seed is given twice"),
-        (["train", "--out", "x", "--log.every", "1", "--log.every=1"], 2, "--log.every is given twice"),
-        (
-            ["train", "--out", "x", "--extend=1"],
-            2,
-            "a number of images from 100 on, or a factor above 1, got 1",
-        ),
-        (["train", "--out", "x", "--extend=100.5"], 2, "a factor above 1, got 100.5"),
-        (["train", "--help", "downscal"], 2, "no such field of the configuration; did you mean downscale"),
-        (["eval", "a\x1b[31m\x07b\nc"], 1, "a\\x1b[31m\\x07b\\nc is not a run"),
-        (["eval", "a", "--\x1b[2J"], 2, "unrecognized arguments: --\\x1b[2J"),
-        (["train", "--data", "d"], 2, "required: --out"),
-        (["train"], 2, "required: --data, --out"),
-        (["train", "--config", "missing.yaml", "--out", "x"], 1, "missing.yaml: no such file or recipe"),
-        (["train", "--config", "missing.yaml", "--out", "x"], 1, "recipes are aerial, aerial_cpu, city"),
-        (["eval", "/nowhere"], 1, "/nowhere is not a run"),
-        (["eval", "/nowhere", "--pictures=-3"], 1, "--pictures: must be 0 or more, got -3"),
-        (["export", "/nowhere", "--ply", "x.ply"], 1, "/nowhere is not a run"),
-        (["train", "--data", "d", "--out", "x", "--device", "tpu"], 1, "cuda or cuda:N, got 'tpu'"),
-        (["train", "--data", "d", "--out", "x", "--device", "cuda:x"], 1, "cuda or cuda:N, got 'cuda:x'"),
-        (["train", "--data", "d", "--out", ""], 2, "argument --out: the path is empty"),
-        (["train", "--data", "", "--out", "x"], 2, "argument --data: the path is empty"),
-        (["eval", ""], 2, "argument MODEL: the path is empty"),
-        (["gate", "fit", "run", "--out", ""], 2, "argument --out: the path is empty"),
-        (["synth", "."], 1, "the folder must be given by its name, got '.'"),
-        (["synth", "city", "--processes=-2"], 1, "processes must be at least 1, got -2"),
-        (["train", "--data", "loop", "--out", "x"], 1, "loop is not a folder"),
-        (["eval", "/nowhere", "--fast"], 2, "unrecognized arguments: --fast (blitzgs eval --help"),
-        (["eval", "/nowhere", "--pictrues=3"], 2, "--pictrues=3; did you mean --pictures?"),
-        (["train", "--data", "d", "--ouut", "x"], 2, "--ouut x; did you mean --out?"),
-        (
-            ["train", "--data", "d", "--out", "x", "--start", "m.ply"],
-            1,
-            "m.ply: there is no such file of Gaussians (--start)",
-        ),
+        ("train --out x", 1, "data.path: no capture given; use --data DIR"),
+        ("train --out x --resume", 1, "x holds no run to continue (it has no config.yaml): check"),
+        ("train --data /nowhere --out x", 1, "/nowhere"),
+        ("train --data d --out x --loss.sim=1", 1, "loss.sim: unknown field; did you mean 'ssim'"),
+        ("train --data d --out x --loss.ssim", 2, "--loss.ssim needs a value: write"),
+        ("train --data d --out x --loss.ssim --resume", 2, "--loss.ssim needs a value"),
+        ("train --data d --out x --loss.ssim 9", 1, "loss.ssim: must be in [0, 1], got 9"),
+        ("train --data d --out x 5", 2, "written --section.field=value"),
+        ("train --data d --out x --resum", 2, "--resum; did you mean --resume?"),
+        ("train --data d --out x --minute=5", 2, "--minute=5; did you mean --minutes?"),
+        ("eval x --dev=cpu", 2, "--dev=cpu; did you mean --device?"),
+        ("eval x --pictures 1 --pictures=2", 2, "--pictures is given twice"),
+        ("train --out x --out=y", 2, "--out is given twice"),
+        ("train --out x --extend=2 --minutes=3", 2, "--extend and --minutes exclude"),
+        ("train --check --resume", 2, "required: --data, --out"),
+        ("train --out x --seed=1 --seed=2", 2, "--seed is given twice"),
+        ("train --out x --log.every 1 --log.every=1", 2, "--log.every is given twice"),
+        ("train --out x --extend=1", 2, "a number of images from 100 on, or a factor above 1, got 1"),
+        ("train --out x --extend=100.5", 2, "a factor above 1, got 100.5"),
+        ("train --help downscal", 2, "no such field of the configuration; did you mean downscale"),
+        ("eval 'a\x1b[31m\x07b\nc'", 1, "a\\x1b[31m\\x07b\\nc is not a run"),
+        ("eval a '--\x1b[2J'", 2, "unrecognized arguments: --\\x1b[2J"),
+        ("train --data d", 2, "required: --out"),
+        ("train", 2, "required: --data, --out"),
+        ("train --config missing.yaml --out x", 1, "missing.yaml: no such file or recipe"),
+        ("train --config missing.yaml --out x", 1, "recipes are aerial, aerial_cpu, city"),
+        ("eval /nowhere", 1, "/nowhere is not a run"),
+        ("eval /nowhere --pictures=-3", 1, "--pictures: must be 0 or more, got -3"),
+        ("export /nowhere --ply x.ply", 1, "/nowhere is not a run"),
+        ("train --data d --out x --device tpu", 1, "cuda or cuda:N, got 'tpu'"),
+        ("train --data d --out x --device cuda:x", 1, "cuda or cuda:N, got 'cuda:x'"),
+        ("train --data d --out ''", 2, "argument --out: the path is empty"),
+        ("train --data '' --out x", 2, "argument --data: the path is empty"),
+        ("eval ''", 2, "argument MODEL: the path is empty"),
+        ("gate fit run --out ''", 2, "argument --out: the path is empty"),
+        ("synth .", 1, "the folder must be given by its name, got '.'"),
+        ("synth city --processes=-2", 1, "processes must be at least 1, got -2"),
+        ("train --data loop --out x", 1, "loop is not a folder"),
+        ("eval /nowhere --fast", 2, "unrecognized arguments: --fast (blitzgs eval --help"),
+        ("eval /nowhere --pictrues=3", 2, "--pictrues=3; did you mean --pictures?"),
+        ("train --data d --ouut x", 2, "--ouut x; did you mean --out?"),
+        ("train --data d --out x --start m.ply", 1, "m.ply: there is no such file of Gaussians (--start)"),
         # Before the capture is read, which takes long.
-        (["train", "--data", "d", "--out", "file/x"], 1, "file is a file where a folder is needed"),
-        (["train", "--data", "d", "--out", "old"], 1, "old already holds a run: add --resume"),
+        ("train --data d --out file/x", 1, "file is a file where a folder is needed"),
+        ("train --data d --out old", 1, "old already holds a run: add --resume"),
     ],
 )
-def test_mistakes_get_a_message(arguments, status, message, capsys, tmp_path, monkeypatch):
+def test_mistakes_get_a_message(command, status, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "300")
     Path("loop").symlink_to("loop")
     Path("file").touch()
     Path("old/checkpoints/checkpoint_000000").mkdir(parents=True)
     try:
-        result = main(arguments)
+        result = main(shlex.split(command))
     except SystemExit as exit_:
         result = exit_.code
     assert result == status
@@ -267,7 +250,7 @@ def test_render_leaves_the_photographs_alone(tmp_path, kind):
         return str(path) if kind == "absolute" else f"../photos/{path.name}"
 
     data, photos = transforms_capture(tmp_path, name_of)
-    flags = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.02")
+    flags = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.02", "population.max_gaussians=500")
     assert main(["train", "--data", str(data), "--out", str(tmp_path / "run"), *flags]) == 0
     before, everything = digest(photos), {path for path in tmp_path.rglob("*")}
     out = tmp_path / "rend" / "a"
@@ -290,43 +273,3 @@ def test_render_leaves_the_photographs_alone(tmp_path, kind):
     assert main(["render", str(tmp_path / "run"), "--split", "all", "--out", str(tmp_path / "copy")]) == 1
     assert {path.read_bytes() for path in (tmp_path / "copy").rglob("*") if path.is_file()} == {b"photograph"}
     assert main(["render", str(tmp_path / "run"), "--split", "all", "--out", str(out)]) == 0
-
-
-K = np.array([[60.0, 0.0, 32.0], [0.0, 60.0, 32.0], [0.0, 0.0, 1.0]])
-
-
-def oblique(place, azimuth, height=10.0):
-    """A camera at (x, y, height) that looks 45 degrees down, at a place `height` away."""
-    forward = np.array([np.cos(azimuth), np.sin(azimuth), -1.0]) / np.sqrt(2)
-    right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack((right, np.cross(forward, right), forward))
-    pose[:3, 3] = -pose[:3, :3] @ np.append(place, height)
-    return Camera("view", 64, 64, K, pose)
-
-
-def test_neighbours_of_a_tour_show_the_same_places():
-    """Four oblique cameras a place: those that show the same place are elsewhere, and look elsewhere."""
-    centres = [(x, y) for x in range(0, 80, 10) for y in range(0, 80, 10)]
-    azimuths = np.arange(4) * np.pi / 2
-    cameras = [oblique(centre, azimuth) for centre in centres for azimuth in azimuths]
-    shown = np.array([np.array(c) + 10 * np.array((np.cos(a), np.sin(a))) for c in centres for a in azimuths])
-    grid = np.arange(-20.0, 92.0, 1.5)
-    points = np.stack((*np.meshgrid(grid, grid), np.zeros((len(grid), len(grid)))), axis=-1).reshape(-1, 3)
-    order = tour_of(cameras, points)
-    assert sorted(order) == list(range(len(cameras)))
-
-    def step(places):
-        return float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1)))
-
-    random = np.random.default_rng(0).permutation(len(cameras))
-    # Neighbours show the same place or the next one, 10 away; along the flight it is 14.
-    assert step(shown[order]) < 10.1
-    assert step(shown) > 14.0
-    assert step(shown[random]) > 30.0
-
-
-def test_cameras_without_points_are_visited_by_their_own_places():
-    centres = np.random.default_rng(1).permutation(np.arange(16.0))
-    cameras = [oblique((x, 0.0), 0.0) for x in centres]
-    assert centres[tour_of(cameras, np.zeros((0, 3)))].tolist() == sorted(centres)

@@ -64,13 +64,7 @@ Curves = dict[str, Any]
 
 
 def train(config: dict[str, Any], folder: Path, jitter: float = 0.0) -> Curves:
-    """Train the tiny capture; return its curves.
-
-    Args:
-        config: as `to_dict` gives it.
-        folder: for the run.
-        jitter: relative change of each parameter at the start.
-    """
+    """Train the tiny capture, each parameter changed by the share `jitter`; return its curves."""
     trainer = Trainer(from_dict(config), *tiny_scene(), folder, Ranks())
     generator = torch.Generator().manual_seed(1)
     for values in trainer.state.table.parameters:

@@ -17,7 +17,7 @@ import torch
 from blitzgs.capture.images import PhotographError
 from blitzgs.config.files import ConfigError
 from blitzgs.distributed.group import Ranks
-from blitzgs.population.importance import PHI, is_culled
+from blitzgs.population.importance import PHI
 from blitzgs.runs import run_files, trained_model
 from blitzgs.runs.guard import ModelLostError
 from blitzgs.spawn.candidates import FEATURES
@@ -35,7 +35,6 @@ from blitzgs.spawn.lineage import ABOUT, Cause
 from blitzgs.spawn.lineage_parts import read_lineage
 from blitzgs.table.table import CULL
 from blitzgs.training.events import importance
-from blitzgs.training.trainer import Trainer
 from blitzgs.util import progress
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.helpers import refused
@@ -44,6 +43,7 @@ from tests.training.tiny import (
     Images,
     assert_same_table,
     events_of,
+    make_trainer,
     read_log,
     stop_at,
     tiny_config,
@@ -54,8 +54,8 @@ from tests.training.tiny import (
 PASSES = ("population.importance=true", "schedule.t1=40", "schedule.t2=80")
 
 
-def train(folder, *overrides, ranks=None, resume=False):
-    return tiny.train(folder, *PASSES, *overrides, ranks=ranks, resume=resume)
+def train(folder, *overrides, **how):
+    return tiny.train(folder, *PASSES, *overrides, **how)
 
 
 def pass_events(folder):
@@ -94,15 +94,6 @@ def test_a_pass_says_how_many_views_are_done(tmp_path, monkeypatch, capsys):
     assert shown.count(f"{views} of {views} views surveyed") == 2
 
 
-def test_the_cull_mask_is_kept_where_views_use_it(tmp_path, monkeypatch):
-    stop_at(monkeypatch, 45)  # the mask is cleared after 50 images
-    trainer, _ = train(tmp_path, "view.cull=true", "schedule.iterations=60")
-    table = trainer.state.table
-    assert table[CULL].shape == (len(table), 1)
-    culled = torch.stack([is_culled(table[CULL], v) for v in range(7)])
-    assert culled.any() and not culled.all()
-
-
 def test_the_population_is_reported(whole_run):
     folder, trainer, summary = whole_run
     report, milestones = summary["population"], trainer.state.progress.milestones
@@ -123,20 +114,6 @@ def test_the_population_is_reported(whole_run):
     # Smaller y is higher in the chart. The first pass makes the population fall at one time, from 40's peak.
     (x1, top), (x2, low) = points[3:5]
     assert x1 == x2 and low > top
-
-
-def test_resume_is_exact_and_carries_the_columns(whole_run, tmp_path, monkeypatch):
-    """The run stops between the passes, when children have inherited phi."""
-    _, whole, _ = whole_run
-    stop_at(monkeypatch, 50)
-    first, summary = train(tmp_path)
-    assert summary is None and PHI in first.state.table
-    monkeypatch.undo()
-    second, _ = train(tmp_path, resume=True)
-    assert_same_table(second.state.table, whole.state.table)
-    assert second.state.progress.milestones == whole.state.progress.milestones
-    model = trained_model.open_model(tmp_path, Ranks())
-    assert torch.equal(model.table[PHI], whole.state.table[PHI])
 
 
 def test_ablations_keep_the_signals(tmp_path):
@@ -175,8 +152,7 @@ EARLY = ("schedule.checkpoint_every=30", "log.keep_checkpoints=9")
 
 def _passes_from(ranks, folder):
     """Make both passes on a model that is divided among the ranks; return ids and their columns."""
-    config = tiny_config(*PASSES, *EARLY, "view.cull=true")
-    trainer = Trainer(config, *tiny_scene(), folder, ranks, resume=True)
+    trainer = make_trainer(folder, *PASSES, *EARLY, "view.cull=true", ranks=ranks, resume=True)
     state, out = trainer.state, []
     for event in state.schedule.events(0, 100):
         if event.kind.startswith("pass"):

@@ -24,15 +24,12 @@ from blitzgs.runs.guard import NonFiniteError
 from blitzgs.spawn.lineage_parts import read_lineage
 from blitzgs.training.agreement import MAX_STEPS, Agreement, SaveClock, StopRequest
 from blitzgs.training.events import save
-from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
 from tests.helpers import refused, save_checkpoint
-from tests.training.tiny import assert_same_table, at_step, read_log, steps_of, tiny_config, tiny_scene
+from tests.training.tiny import assert_same_table, at_step, read_log, steps_of, tiny_config
+from tests.training.tiny import make_trainer as trainer
 
-
-def trainer(folder, *overrides, images=None, resume=False):
-    capture, own = tiny_scene()
-    return Trainer(tiny_config(*overrides), capture, images or own, folder, Ranks(), resume)
+SHORT = "schedule.iterations=20"
 
 
 def checkpoints(folder):
@@ -78,10 +75,10 @@ def test_a_checkpoint_is_written_by_the_clock_by_default(tmp_path, monkeypatch):
         self.state.save_clock.restart(0)
 
     at_step(monkeypatch, 33, ten_minutes_later)
-    trainer(tmp_path).train()
+    trainer(tmp_path, "schedule.iterations=40").train()
     folder = tmp_path / "checkpoints"
     states = [checkpoint.load(folder / name, Ranks(), "cpu").state for name in checkpoints(tmp_path)]
-    assert [state["progress"]["step"] for state in states] == [33, 100]
+    assert [state["progress"]["step"] for state in states] == [33, 40]
 
 
 @pytest.mark.parametrize("room", [0, 1 << 40])
@@ -107,7 +104,7 @@ def test_training_goes_on_while_a_checkpoint_is_written(tmp_path, monkeypatch, r
     monkeypatch.setattr(checkpoint, "write_shard", write_late)
     at_step(monkeypatch, 33, lambda self: self.state.save_clock.restart(0))
     at_step(monkeypatch, 36, go_on)
-    trainer(tmp_path).train()
+    trainer(tmp_path, "schedule.iterations=40").train()
     loaded = checkpoint.load(tmp_path / "checkpoints" / "checkpoint_000000", Ranks(), "cpu")
     assert loaded.state["progress"]["step"] == 33 and then == [room > 0, True]
     assert loaded.columns.keys() == saved["columns"].keys()
@@ -139,8 +136,9 @@ def test_nohup_is_respected_and_a_second_signal_does_not_interrupt_the_save():
         signal.signal(signal.SIGHUP, before)
 
 
-def _agreements(ranks, seconds, late):
+def _agreements(ranks, seconds, most, late):
     stop, clock = StopRequest(), SaveClock(0)
+    pytest.MonkeyPatch().setattr("blitzgs.training.agreement.MAX_SECONDS", most)
     agreement = Agreement(ranks, stop, clock)
     agreement._reads_late = late
     decisions = []
@@ -169,17 +167,10 @@ def _agreements(ranks, seconds, late):
     ],
 )
 def test_ranks_agree_after_the_same_step_and_slow_steps_do_not_wait(seconds, most, late, stop_at, save_at):
-    first, second = run_ranks(_agreements_within, 2, seconds, most, late)
+    first, second = run_ranks(_agreements, 2, seconds, most, late)
     assert first == second
     assert [step for step, (_, saves) in enumerate(first, 1) if saves] == [save_at]
     assert len(first) == stop_at and first[-1][0] == "SIGTERM"
-
-
-def _agreements_within(ranks, seconds, most, late):
-    from blitzgs.training import agreement
-
-    agreement.MAX_SECONDS = most
-    return _agreements(ranks, seconds, late)
 
 
 class TwoRanks(Ranks):
@@ -211,8 +202,7 @@ def test_a_lost_photograph_ends_the_run_in_time(monkeypatch, late):
 def test_records_that_are_written_a_step_later_are_the_same(tmp_path, monkeypatch, end):
     found = []
     for late in (False, True):
-        capture, images = tiny_scene()
-        running = trainer(tmp_path / str(late), "schedule.iterations=50", "log.every=1", images=images)
+        running = trainer(tmp_path / str(late), "schedule.iterations=50", "log.every=1")
         running._writes_late = late
         with monkeypatch.context() as patch:
             if end == "signal":
@@ -222,7 +212,7 @@ def test_records_that_are_written_a_step_later_are_the_same(tmp_path, monkeypatc
 
                 def lost(place, steps, get=get):
                     if place == 33:
-                        raise FileNotFoundError(errno.ENOENT, "No such file or directory", "/photos/00.png")
+                        raise FileNotFoundError("/photos/00.png")
                     return get(place, steps)
 
                 patch.setattr(running.loader, "get", lost)
@@ -246,18 +236,11 @@ def test_records_that_are_written_a_step_later_are_the_same(tmp_path, monkeypatc
 def test_a_photograph_that_vanishes_costs_nothing(tmp_path, monkeypatch):
     whole = trainer(tmp_path / "whole")
     whole.train()
-    capture, images = tiny_scene()
-    get = images.get
-
-    def gone(index, factor=1):
-        raise FileNotFoundError(errno.ENOENT, "No such file or directory", f"/photos/{index:02}.png")
-
-    at_step(monkeypatch, 40, lambda self: setattr(images, "get", gone))
-    running = trainer(tmp_path / "cut", images=images)
-    refused(PhotographError, r"/photos/0\d.png'.*put the photograph back.*--resume", running.train)
+    at_step(monkeypatch, 40, lambda self: self.state.images.lose())
+    running = trainer(tmp_path / "cut")
+    refused(PhotographError, r"/photos/0\d.png .*put the photograph back.*--resume", running.train)
     saved = trained_model.restore(tmp_path / "cut", Ranks()).progress.step
     assert 40 <= saved <= 44  # some batches were loaded ahead
-    images.get = get
     monkeypatch.undo()
     resumed = trainer(tmp_path / "cut", resume=True)
     resumed.train()
@@ -265,41 +248,31 @@ def test_a_photograph_that_vanishes_costs_nothing(tmp_path, monkeypatch):
 
 
 def test_a_held_out_photograph_that_vanishes_costs_nothing(tmp_path):
-    capture, images = tiny_scene()
-    get = images.get
-
-    def held_out_is_gone(index, factor=1):
-        if index in capture.test:
-            raise ValueError(f"/photos/{index:02}.png is no JPEG or PNG file")
-        return get(index)
-
-    images.get = held_out_is_gone
-    running = trainer(tmp_path, "schedule.evaluate_every=30", images=images)
+    running = trainer(tmp_path, "schedule.evaluate_every=30")
+    running.state.images.lose(*running.state.capture.test, error=ValueError)
     refused(PhotographError, r"/photos/03.png.*put the photograph back.*--resume", running.train)
     assert trained_model.restore(tmp_path, Ranks()).progress.step == 31
-    images.get = get
     assert trainer(tmp_path, "schedule.evaluate_every=30", resume=True).train() is not None
 
 
-def fail_saves(monkeypatch, count, also=lambda: None):
-    """Let the next `count` checkpoints fail as on a full disk."""
-    left = [count]
-    real = checkpoint.write_shard
+def fail_writes(monkeypatch, count, module=checkpoint, name="write_shard", also=lambda: None):
+    """Let the next `count` calls of a function that writes fail as on a full disk."""
+    failures, real = iter(range(count)), getattr(module, name)
 
-    def write_shard(*args):
-        if left[0]:
-            left[0] -= 1
+    def write(*args, **options):
+        if next(failures, None) is not None:
             also()
             raise OSError(errno.ENOSPC, "No space left on device")
-        return real(*args)
+        return real(*args, **options)
 
-    monkeypatch.setattr(checkpoint, "write_shard", write_shard)
+    monkeypatch.setattr(module, name, write)
+    return failures
 
 
 def test_a_full_disk_in_the_middle_is_survived(tmp_path, monkeypatch, capsys):
-    fail_saves(monkeypatch, 1)
+    fail_writes(monkeypatch, 1)
     monkeypatch.setattr(save, "RETRY_SECONDS", 0.0)
-    summary = trainer(tmp_path, "schedule.checkpoint_every=50").train()
+    summary = trainer(tmp_path, SHORT, "schedule.checkpoint_every=10").train()
     assert summary is not None
     shown = capsys.readouterr().out.replace("\n", " ")
     assert "was not saved" in shown and "Training goes on" in shown
@@ -307,18 +280,18 @@ def test_a_full_disk_in_the_middle_is_survived(tmp_path, monkeypatch, capsys):
 
 
 def test_the_last_checkpoint_waits_for_room(tmp_path, monkeypatch, capsys):
-    fail_saves(monkeypatch, 2)
+    fail_writes(monkeypatch, 2)
     monkeypatch.setattr(save, "FIRST_WAIT_SECONDS", 0.01)
-    assert trainer(tmp_path).train() is not None
+    assert trainer(tmp_path, SHORT).train() is not None
     shown = capsys.readouterr().out
     assert shown.count("The model is still in memory: free some space") == 2
-    assert trained_model.restore(tmp_path, Ranks()).progress.step == 100
+    assert trained_model.restore(tmp_path, Ranks()).progress.step == 20
 
 
 def test_waiting_for_room_ends_when_asked(tmp_path, monkeypatch):
-    fail_saves(monkeypatch, 9, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    fail_writes(monkeypatch, 9, also=lambda: os.kill(os.getpid(), signal.SIGTERM))
     monkeypatch.setattr(save, "FIRST_WAIT_SECONDS", 0.01)
-    refused(checkpoint.CheckpointError, "the disk is full", trainer(tmp_path).train)
+    refused(checkpoint.CheckpointError, "the disk is full", trainer(tmp_path, SHORT).train)
 
 
 @pytest.mark.parametrize(
@@ -335,7 +308,7 @@ def test_another_error_than_lack_of_space_saves_elsewhere_at_once(tmp_path, monk
 
     monkeypatch.setattr(checkpoint, "write_shard", write_shard)
     monkeypatch.setattr(save.time, "sleep", lambda seconds: pytest.fail("it waits"))
-    running = trainer(tmp_path / "run")
+    running = trainer(tmp_path / "run", SHORT)
     with pytest.raises(checkpoint.CheckpointError) as failure:
         running.train()
     message = str(failure.value)
@@ -344,7 +317,7 @@ def test_another_error_than_lack_of_space_saves_elsewhere_at_once(tmp_path, monk
     assert (f"The model is saved in {saved}: continue with --resume --out" in message) == elsewhere
     assert ("it is lost" in message) != elsewhere
     if elsewhere:
-        assert trained_model.restore(saved, Ranks()).progress.step == 100
+        assert trained_model.restore(saved, Ranks()).progress.step == 20
         assert open_run(saved).cameras().test == [3] and len(open_run(saved).model()) > 0
 
 
@@ -353,25 +326,17 @@ def test_a_file_in_the_place_of_the_checkpoints_ends_the_run_with_the_model_save
         shutil.rmtree(tmp_path / "checkpoints")
         (tmp_path / "checkpoints").touch()
 
-    at_step(monkeypatch, 50, replace_folder)
-    refused(checkpoint.CheckpointError, "The model is saved in .*rescued_", trainer(tmp_path).train)
+    at_step(monkeypatch, 10, replace_folder)
+    refused(checkpoint.CheckpointError, "The model is saved in .*rescued_", trainer(tmp_path, SHORT).train)
 
 
 def test_a_lineage_that_cannot_be_written_waits_as_well(tmp_path, monkeypatch):
     parquet = pytest.importorskip("pyarrow.parquet")
-    left, real = [2], parquet.write_table
-
-    def write_table(*args, **options):
-        if left[0]:
-            left[0] -= 1
-            raise OSError(errno.ENOSPC, "No space left on device")
-        real(*args, **options)
-
-    monkeypatch.setattr(parquet, "write_table", write_table)
+    failures = fail_writes(monkeypatch, 2, parquet, "write_table")
     monkeypatch.setattr(save, "FIRST_WAIT_SECONDS", 0.01)
     flags = ("population.lineage=true", "schedule.iterations=50")
     running = trainer(tmp_path, *flags)
-    assert running.train() is not None and left == [0]
+    assert running.train() is not None and not list(failures)
     births = read_lineage(tmp_path / "lineage")["births"]["id"]
     assert len(set(births.tolist())) == len(births) == running.state.lineage.ledger.births
 
@@ -408,12 +373,12 @@ def test_a_log_that_cannot_be_written_ends_nothing(tmp_path, monkeypatch):
 def test_an_evaluation_that_cannot_be_written_ends_nothing(tmp_path):
     tmp_path.joinpath("evaluation").write_text("not a folder")
     with pytest.warns(UserWarning, match="the evaluation could not write a file and goes on"):
-        assert trainer(tmp_path, "schedule.iterations=20").train()["psnr"] > 5
+        assert trainer(tmp_path, SHORT).train()["psnr"] > 5
 
 
 def test_a_log_of_another_run_or_with_a_torn_line_ends_nothing(tmp_path, monkeypatch):
     """A run that was killed before its first checkpoint leaves its log to the next one in the folder."""
-    trainer(tmp_path / "clean").train()
+    trainer(tmp_path / "clean", "schedule.iterations=50").train()
     other = {"t": 20, "run": "another", "event": "densify", "gaussians": 123_456_789}
     torn = '{"t": 20, "run": "another", "ev'
 
@@ -422,7 +387,7 @@ def test_a_log_of_another_run_or_with_a_torn_line_ends_nothing(tmp_path, monkeyp
             file.write(json.dumps(other) + "\n" + torn + "\n")
 
     at_step(monkeypatch, 1, add_records)
-    assert trainer(tmp_path / "second").train() is not None
+    assert trainer(tmp_path / "second", "schedule.iterations=50").train() is not None
     pictures = [(tmp_path / name / "trajectory.svg").read_text() for name in ("clean", "second")]
     assert pictures[0] == pictures[1]
 
@@ -437,7 +402,7 @@ def test_a_terminal_that_is_gone_ends_nothing(tmp_path, monkeypatch):
         flush = write
         isatty = staticmethod(lambda: False)
 
-    running = trainer(tmp_path)
+    running = trainer(tmp_path, SHORT)
     monkeypatch.setattr(sys, "stdout", Gone())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+"""Trainings with a part of the Gaussians on the device are those with all of them there."""
 
 import numpy as np
 import pytest
@@ -11,19 +12,20 @@ from blitzgs.runs.evaluation import render_view
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.pool import Pool, PoolError
 from blitzgs.table.table import GaussianTable
-from blitzgs.training.trainer import Trainer
 from blitzgs.view.visible import VisibleFinder
 from tests.distributed.rank_harness import run_ranks
 from tests.helpers import DEVICES, refused
+from tests.training import tiny
 from tests.training.tiny import (
     HEIGHT,
     WIDTH,
     Camera,
+    assert_same_table,
     photographed,
     random_gaussians,
+    sorted_rows,
     steps_of,
     stop_at,
-    tiny_config,
     trained_in_parts,
 )
 
@@ -49,17 +51,17 @@ def street(count=COUNT):
     return photographed(truth, cameras, test=5, extent=24.0)
 
 
+def make_trainer(folder, *overrides, **how):
+    return tiny.make_trainer(folder, *SETTINGS, *overrides, scene=street(), **how)
+
+
 def train(folder, *overrides, device="cpu", resume=False):
-    config = tiny_config(*SETTINGS, *overrides)
-    trainer = Trainer(config, *street(), folder, Ranks(device=torch.device(device)), resume)
+    trainer = make_trainer(folder, *overrides, ranks=Ranks(device=torch.device(device)), resume=resume)
     return trainer, trainer.train()
 
 
 def assert_same_run(one, other):
-    tables = (one.state.table, other.state.table)
-    order, same = (table["id"].argsort() for table in tables)
-    for name in tables[0]:
-        assert torch.equal(tables[0][name][order].cpu(), tables[1][name][same].cpu()), name
+    assert_same_table(sorted_rows(one.state.table), sorted_rows(other.state.table))
     assert one.state.progress.peak_gaussians == other.state.progress.peak_gaussians
 
 
@@ -129,7 +131,7 @@ def test_a_tour_goes_on_where_it_was_interrupted(tmp_path):
 
 
 def _drawn(ranks, folder):
-    trainer = Trainer(tiny_config(*SETTINGS, *TOUR), *street(), folder, ranks)
+    trainer = make_trainer(folder, *TOUR, ranks=ranks)
     return [trainer.state.sampler.batch(step) for step in range(60)]
 
 
@@ -140,7 +142,7 @@ def test_a_tour_is_the_same_on_every_rank_of_any_number(tmp_path):
 
 
 def _train(ranks, folder, overrides):
-    trainer = Trainer(tiny_config(*SETTINGS, *overrides), *street(), folder, ranks)
+    trainer = make_trainer(folder, *overrides, ranks=ranks)
     trainer.train()
     table = trainer.state.table
     return {name: table[name].clone() for name in table}
@@ -154,9 +156,7 @@ def test_two_ranks_share_a_run_beyond_their_memory(tmp_path):
         {name: torch.cat([share[name] for share in shares]) for name in shares[0]}
         for shares in (whole, pooled)
     )
-    order, same = expected["id"].argsort(), got["id"].argsort()
-    for name in expected:
-        assert torch.equal(got[name][same], expected[name][order]), name
+    assert_same_table(sorted_rows(got), sorted_rows(expected))
 
 
 def test_a_model_with_a_cull_mask_is_rendered_through_a_pool(tmp_path, monkeypatch):
@@ -178,8 +178,7 @@ def test_a_model_with_a_cull_mask_is_rendered_through_a_pool(tmp_path, monkeypat
         assert torch.equal(render_view(finder, views, i, options, owners), image)
         assert image.std() > 0.01
     pool.write_back()
-    for name in whole:
-        assert torch.equal(model.table[name], whole[name]), name
+    assert_same_table(model.table, whole)
 
 
 def test_rows_are_sorted_for_a_pool_or_for_another_number_of_ranks(tmp_path):
@@ -190,8 +189,7 @@ def test_rows_are_sorted_for_a_pool_or_for_another_number_of_ranks(tmp_path):
     assert restored.progress.sorted_spread == 0
     model = trained_model.open_model(tmp_path / "one", Ranks(), resident_gb=0.1)
     pool = model.subject(Ranks()).gaussians
-    config = tiny_config(*SETTINGS, "schedule.iterations=20", RESIDENT)
-    resumed = Trainer(config, *street(), tmp_path / "one", Ranks(), resume=True)
+    resumed = make_trainer(tmp_path / "one", "schedule.iterations=20", RESIDENT, resume=True)
     for table in (restored.table, pool.table, resumed.state.table):
         assert torch.equal(morton_order(table["means"]), torch.arange(len(table)))
 
@@ -225,12 +223,11 @@ def test_a_pass_that_does_not_fit_costs_nothing_and_happens_with_a_larger_pool(t
 
 
 def test_a_mask_for_a_table_of_less_than_a_block(tmp_path):
-    options = ("population.importance=true", "schedule.t1=30", "schedule.t2=0", "view.cull=true",
-               "population.grad_threshold=1e30", "schedule.iterations=45")  # fmt: skip
-    runs = []
-    for number, more in enumerate((["memory.resident_gb=0.0078"], [])):
-        config = tiny_config("lod.visible_threshold=0", *options, *more)
-        runs.append(Trainer(config, *street(50), tmp_path / str(number), Ranks()))
-        runs[-1].train()
-        assert 0 < len(runs[-1].state.table) < 256
+    passes = ("population.importance=true", "schedule.t1=30", "schedule.t2=0", "view.cull=true")
+    options = ("population.grad_threshold=1e30", "schedule.iterations=45", "lod.visible_threshold=0", *passes)
+    runs = [
+        tiny.train(tmp_path / name, *options, *more, scene=street(50))[0]
+        for name, more in (("pooled", [RESIDENT]), ("whole", []))
+    ]
+    assert all(0 < len(run.state.table) < 256 for run in runs)
     assert_same_run(*runs)

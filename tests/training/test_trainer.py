@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
@@ -17,11 +18,13 @@ from tests.helpers import DEVICES, needs_cuda, refused
 from tests.training.tiny import (
     assert_same_table,
     events_of,
+    make_trainer,
+    sorted_rows,
     steps_of,
     stop_at,
-    tiny_config,
     tiny_scene,
     train,
+    trained_in_parts,
 )
 
 
@@ -44,16 +47,8 @@ def test_training_improves_the_images(whole_run, tmp_path):
 def test_what_a_run_leaves_behind(whole_run):
     folder, trainer, summary = whole_run
     assert json.loads((folder / "summary.json").read_text()) == summary
-    for name in (
-        "psnr",
-        "ssim",
-        "seconds",
-        "images_per_second",
-        "peak_memory_bytes",
-        "config_hash",
-        "versions",
-    ):
-        assert summary[name]
+    figures = ("psnr", "ssim", "seconds", "images_per_second", "peak_memory_bytes", "config_hash", "versions")
+    assert all(summary[name] for name in figures)
     assert summary["peak_gaussians"] >= summary["gaussians"]
     assert [r["t"] for r in steps_of(folder)] == [20, 40, 60, 80, 100]
     assert [r["t"] for r in events_of(folder, "densify")] == [20, 40, 60, 80]
@@ -139,57 +134,48 @@ def test_a_checkpoint_has_all_events_of_its_step(tmp_path):
 @pytest.mark.parametrize("power", [-7, 10])
 def test_a_world_scaled_by_a_power_of_two_trains_to_the_same_bits(whole_run, tmp_path, power):
     _, whole, expected = whole_run
-    scaled, summary = train(tmp_path, scale=2.0**power)
+    scaled, summary = train(tmp_path, scene=tiny_scene(2.0**power))
     assert_same_table(scaled.state.table, whole.state.table)
     assert scaled.state.space.unit == whole.state.space.unit * 2.0**power
     assert summary["psnr"] == expected["psnr"]
 
 
 def test_batches_masks_and_background(tmp_path):
-    capture, images = tiny_scene()
+    _, images = scene = tiny_scene()
     images.masks = [torch.ones(32, 48, dtype=torch.uint8) for _ in images.images]
     for image, mask in zip(images.images, images.masks, strict=True):
         mask[:, :24] = 0
         image[:, :24] = 255
     images.masks[0] = None
-    config = tiny_config(
-        "schedule.batch_size=4",
-        "schedule.iterations=120",
-        "model.background=[0.2, 0.2, 0.2]",
-        "population.max_gaussians=420",
-    )
-    trainer = Trainer(config, capture, images, tmp_path, Ranks())
-    start = len(trainer.state.table)
-    summary = trainer.train()
+    options = ("schedule.batch_size=4", "schedule.iterations=120", "population.max_gaussians=420")
+    trainer, summary = train(tmp_path, *options, "model.background=[0.2, 0.2, 0.2]", scene=scene)
     assert summary["images"] == 120 and trainer.state.progress.step == 30
     assert summary["psnr"] > 15
-    assert max(start, 420) >= trainer.state.progress.peak_gaussians
+    assert trainer.state.progress.peak_gaussians <= 420
 
 
 @pytest.mark.parametrize("white", [0, 1], ids=["black", "inverted"])
 def test_training_views_that_are_masked_almost_as_a_whole_are_counted(tmp_path, white):
     """Masks whose meaning is inverted exclude all or almost all of a view; the run says so, once."""
-    capture, images = tiny_scene()
+    capture, images = scene = tiny_scene()
     images.masks = [torch.zeros(32, 48, dtype=torch.uint8) for _ in images.images]
     for mask in images.masks:
         mask[:8, :8] = white  # 4 % of the pixels
     images.masks[capture.test[0]] = None
-    config = tiny_config("schedule.iterations=40")
     with pytest.warns(UserWarning, match="7 of the first 7 training views are masked by more than") as found:
-        Trainer(config, capture, images, tmp_path, Ranks()).train()
+        train(tmp_path, "schedule.iterations=40", scene=scene)
     assert len(found) == 1 and "95%: black excludes a pixel and white counts" in str(found[0].message)
     # A step without a pixel that counts has no PSNR.
     assert ["psnr" in record for record in steps_of(tmp_path)] == [bool(white)] * 2
 
 
 def test_a_short_run_and_only_some_masks(tmp_path):
-    capture, images = tiny_scene()
+    capture, images = scene = tiny_scene()
     images.masks = [None] * 8
     images.masks[capture.train[0]] = torch.zeros(32, 48, dtype=torch.uint8)
     images.masks[capture.train[1]] = torch.ones(32, 48, dtype=torch.uint8)
-    config = tiny_config("schedule.iterations=10", "log.every=100")
     with pytest.warns(UserWarning, match="1 of the first 7 training views are masked"):
-        Trainer(config, capture, images, tmp_path, Ranks()).train()
+        train(tmp_path, "schedule.iterations=10", "log.every=100", scene=scene)
 
 
 def test_the_start_line_names_the_size_of_downscaled_images(tmp_path, capsys):
@@ -198,10 +184,9 @@ def test_the_start_line_names_the_size_of_downscaled_images(tmp_path, capsys):
         printed = capsys.readouterr().out
         assert ("; images of 48 x 32 (data.downscale=4)" in printed) == (factor == 4)
         assert not events_of(tmp_path / name, "hint")  # one rank needs no larger batch
-    capture, images = tiny_scene()
+    capture, images = scene = tiny_scene()
     capture.cameras[0].width, images.images[0] = 40, images.images[0][:, :40]
-    config = tiny_config("data.downscale=2", "schedule.iterations=1")
-    Trainer(config, capture, images, tmp_path / "sizes", Ranks()).train()
+    train(tmp_path / "sizes", "data.downscale=2", "schedule.iterations=1", scene=scene)
     assert "; images of at most 48 x 32 (data.downscale=2)" in capsys.readouterr().out
 
 
@@ -218,9 +203,8 @@ def test_a_batch_that_is_small_for_its_ranks_gets_a_hint(batch, ranks, enough):
 def test_views_that_see_nothing(tmp_path):
     capture, images = tiny_scene()
     for camera in capture.cameras:
-        turned = np.diag([-1.0, 1.0, -1.0, 1.0])
-        camera.world_to_camera = turned @ camera.world_to_camera
-    trainer = Trainer(tiny_config("schedule.iterations=40"), capture, images, tmp_path, Ranks())
+        camera.world_to_camera = np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera.world_to_camera
+    trainer = make_trainer(tmp_path, "schedule.iterations=40", scene=(capture, images))
     before = trainer.state.table["means"].clone()
     trainer.train()
     assert torch.equal(trainer.state.table["means"], before)
@@ -228,7 +212,7 @@ def test_views_that_see_nothing(tmp_path):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_non_finite_values_stop_the_run_by_name(tmp_path, device):
-    trainer = Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks(device=torch.device(device)))
+    trainer = make_trainer(tmp_path, ranks=Ranks(device=torch.device(device)))
     trainer.state.table["scales"][trainer.state.table["id"] == 7, 1] = float("nan")
     refused(NonFiniteError, r"step 20: column 'scales' is not finite in 1 Gaussians \(ids 7\)", trainer.train)
 
@@ -236,7 +220,6 @@ def test_non_finite_values_stop_the_run_by_name(tmp_path, device):
 def test_a_non_finite_loss_names_step_and_view(tmp_path, monkeypatch):
     from blitzgs.training import step as module
 
-    trainer = Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks())
     original = module.loss_terms
 
     def broken(*args):
@@ -244,10 +227,8 @@ def test_a_non_finite_loss_names_step_and_view(tmp_path, monkeypatch):
         return terms._replace(parts=terms.parts * torch.tensor([1.0, float("inf")]))
 
     monkeypatch.setattr(module, "loss_terms", broken)
-    with pytest.raises(
-        NonFiniteError, match=r"step 1: the loss of view '0\d.png' is not finite; .* op photometric"
-    ):
-        trainer.train()
+    message = r"step 1: the loss of view '0\d.png' is not finite; .* op photometric"
+    refused(NonFiniteError, message, train, tmp_path)
 
 
 def test_a_run_is_not_overwritten_nor_resumed_with_another_configuration(whole_run):
@@ -264,17 +245,12 @@ def test_a_run_is_not_overwritten_nor_resumed_with_another_configuration(whole_r
 
 @pytest.mark.cuda
 @needs_cuda
-def test_cuda_trains_like_the_cpu_and_resumes_exactly(whole_run, tmp_path, monkeypatch):
+def test_cuda_trains_like_the_cpu_and_resumes_exactly(whole_run, tmp_path):
     ranks = Ranks(device=torch.device("cuda"))
-    config = tiny_config("model.deterministic=true")
-    whole = Trainer(config, *tiny_scene(), tmp_path / "whole", ranks)
-    summary = whole.train()
+    on_gpu = partial(train, ranks=ranks)
+    whole, summary = on_gpu(tmp_path / "whole", "model.deterministic=true")
     assert summary["psnr"] == pytest.approx(whole_run[2]["psnr"], abs=1.0)
-    stop_at(monkeypatch, 50)
-    assert Trainer(config, *tiny_scene(), tmp_path / "cut", ranks).train() is None
-    monkeypatch.undo()
-    resumed = Trainer(config, *tiny_scene(), tmp_path / "cut", ranks, resume=True)
-    resumed.train()
+    resumed = trained_in_parts(on_gpu, tmp_path / "cut", 50, "model.deterministic=true")
     assert_same_table(resumed.state.table, whole.state.table)
 
 
@@ -291,9 +267,6 @@ def test_a_table_is_sorted_rarely_and_a_run_is_the_same_if_it_is_sorted_often(
             monkeypatch.setattr(densify, "MOST_SPREAD", 0.0)
         trainer, _ = train(tmp_path / name, *options)
         assert [event.get("sorted", 0) == 1 for event in events_of(tmp_path / name, "densify")] == sorts
-        table = trainer.state.table
-        order = table["id"].argsort()
-        tables.append({column: table[column][order] for column in table})
+        tables.append(sorted_rows(trainer.state.table))
     assert len(tables[0]["id"]) > 450
-    for column, values in tables[0].items():
-        assert torch.equal(values, tables[1][column]), column
+    assert_same_table(*tables)

@@ -22,18 +22,24 @@ from blitzgs.config.files import load_config
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.training import inputs
-from blitzgs.training.budget import _grown, estimate
 from blitzgs.training.understood import (
     HopelessCaptureError,
     _exposure,
+    _grown,
     _look,
     check_worlds,
+    estimate,
     large_images_hint,
     undistortion_note,
 )
 from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, as_flags, tiny_config, write_tiny_capture
 
 FLAGS = as_flags("config=defaults", *OVERRIDES, "schedule.iterations=10")
+
+
+@pytest.fixture(scope="module")
+def loaded(capture):
+    return load_capture(capture)
 
 
 @pytest.fixture
@@ -176,36 +182,32 @@ def test_a_run_keeps_its_near_plane(data, tmp_path, capsys):
     [("1000000\n", 800_000, 250_000), ("1000000\n", 300_000, 150_000), ("max\n", 300_000, 150_000)],
 )
 def test_ranks_share_at_most_half_of_the_memory_of_a_container(
-    tmp_path, monkeypatch, limit, cache_bytes, budget
+    capture, tmp_path, monkeypatch, limit, cache_bytes, budget
 ):
-    write_tiny_capture(tmp_path / "capture")
     (tmp_path / "memory.max").write_text(limit)
     monkeypatch.setattr(inputs, "_CONTAINER_LIMIT", tmp_path / "memory.max")
-    config = tiny_config(f"data.path={tmp_path / 'capture'}", f"data.cache_bytes={cache_bytes}")
+    config = tiny_config(f"data.path={capture}", f"data.cache_bytes={cache_bytes}")
     _, images = inputs.open_capture(config, Ranks(local_world_size=2))
     assert images.compressed.budget == budget and images.decoded.budget == budget // 4 + budget
 
 
-def test_without_a_container_the_memory_of_the_host_counts(tmp_path, monkeypatch):
-    write_tiny_capture(tmp_path / "capture")
+def test_without_a_container_the_memory_of_the_host_counts(capture, tmp_path, monkeypatch):
     monkeypatch.setattr(inputs, "_CONTAINER_LIMIT", tmp_path / "missing")
     monkeypatch.setattr(inputs.os, "sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 100}[name])
-    _, images = inputs.open_capture(tiny_config(f"data.path={tmp_path / 'capture'}"), Ranks())
+    _, images = inputs.open_capture(tiny_config(f"data.path={capture}"), Ranks())
     assert images.compressed.budget == 4096 * 50
 
 
-def test_ranks_whose_photographs_do_not_fit_get_a_hint(tmp_path, monkeypatch):
-    write_tiny_capture(tmp_path / "capture")
-    _, images = inputs.open_capture(tiny_config(f"data.path={tmp_path / 'capture'}"), Ranks())
-    capture, size = images.capture, inputs.size_of(inputs.decoded_shapes(images.capture))
+def test_ranks_whose_photographs_do_not_fit_get_a_hint(loaded, monkeypatch):
+    size = inputs.size_of(inputs.decoded_shapes(loaded))
     monkeypatch.setattr(inputs, "_host_memory", lambda: 4 * size)
-    assert inputs.sharing_hint(capture, 2 * size, 2) is None
-    assert inputs.sharing_hint(capture, 2 * size - 2, 1) is None
-    hint = inputs.sharing_hint(capture, 2 * size - 2, 2)
+    assert inputs.sharing_hint(loaded, 2 * size, 2) is None
+    assert inputs.sharing_hint(loaded, 2 * size - 2, 1) is None
+    hint = inputs.sharing_hint(loaded, 2 * size - 2, 2)
     assert "each rank decodes the photographs for itself" in hint
     assert "--data.cache_bytes=1_000_000_000," in hint  # rounded up to whole gigabytes
     monkeypatch.setattr(inputs, "_host_memory", lambda: 4 * size - 4)
-    assert inputs.sharing_hint(capture, 2 * size - 2, 2) is None
+    assert inputs.sharing_hint(loaded, 2 * size - 2, 2) is None
 
 
 def test_the_ranks_of_a_host_divide_the_search_for_damage(tmp_path):
@@ -270,34 +272,27 @@ def test_undistortion_says_the_sizes(k1, policy, says):
 VIEWS = 7  # of the tiny capture, without the one that is held out
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("capture")
-    write_tiny_capture(folder)
-    return load_capture(folder)
-
-
 def config_of(*overrides):
-    return load_config(None, [f"{text}" for text in overrides])
+    return load_config(None, overrides)
 
 
-def test_the_memory_of_a_known_population(capture):
-    found = estimate(config_of("population.max_gaussians=400", "schedule.batch_size=2"), capture, True, 2)
+def test_the_memory_of_a_known_population(loaded):
+    found = estimate(config_of("population.max_gaussians=400", "schedule.batch_size=2"), loaded, True, 2)
     row = 3 * 59 * 4 + 42 + 180 + 500  # 59 parameters with two moments, and the widest column once more
     assert found.gaussians == 400
     assert found.device_bytes == 400 * row + 2 * WIDTH * HEIGHT * 100
     assert found.host_bytes == 2_000_000_000 + 3 * VIEWS * WIDTH * HEIGHT
     flat = "population.max_gaussians=400", "schedule.batch_size=2", "model.sh_degree=0"
-    fewer = found.device_bytes - estimate(config_of(*flat), capture, True, 2).device_bytes
+    fewer = found.device_bytes - estimate(config_of(*flat), loaded, True, 2).device_bytes
     assert fewer == 400 * (3 * 45 * 4 + 180 - 12)  # of the rest of SH, and a widest column of 3 values
-    on_cpu = estimate(config_of("population.max_gaussians=400", "schedule.batch_size=2"), capture, False, 2)
+    on_cpu = estimate(config_of("population.max_gaussians=400", "schedule.batch_size=2"), loaded, False, 2)
     assert on_cpu.device_bytes == 0
     assert on_cpu.host_bytes == 400_000_000 + 3 * VIEWS * WIDTH * HEIGHT + found.device_bytes
 
 
-def test_minutes_are_those_that_were_asked_for(capture):
-    assert estimate(config_of("schedule.minutes=7"), capture, False, 2).minutes == 7
-    one, four = (estimate(config_of(), capture, False, cores).minutes for cores in (1, 4))
+def test_minutes_are_those_that_were_asked_for(loaded):
+    assert estimate(config_of("schedule.minutes=7"), loaded, False, 2).minutes == 7
+    one, four = (estimate(config_of(), loaded, False, cores).minutes for cores in (1, 4))
     assert one == pytest.approx(4 * four)
 
 

@@ -10,7 +10,6 @@ import torch
 import blitzgs
 from blitzgs.cli import main
 from blitzgs.config.fields import ScheduleConfig
-from blitzgs.config.files import ConfigError
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply, write_ply
@@ -22,19 +21,18 @@ from blitzgs.table.table import CULL, GaussianTable
 from blitzgs.training import view_level
 from blitzgs.training.events import evaluate
 from blitzgs.training.step import Stepper
-from blitzgs.training.trainer import Trainer
 from blitzgs.view.gate import centres_of
 from tests.distributed.rank_harness import on_each_device, run_ranks
-from tests.helpers import refused
 from tests.training import tiny
 from tests.training.tiny import (
     OVERRIDES,
     as_flags,
     assert_same_table,
     events_of,
+    lose_view,
+    make_trainer,
     steps_of,
     stop_at,
-    tiny_config,
     tiny_scene,
     trained_in_parts,
     write_tiny_capture,
@@ -47,8 +45,17 @@ FLAGS = (
 )  # fmt: skip
 
 
-def train(folder, *overrides, resume=False):
-    return tiny.train(folder, *FLAGS, *overrides, resume=resume)
+def train(folder, *overrides, **how):
+    return tiny.train(folder, *FLAGS, *overrides, **how)
+
+
+def resume_without_a_view(folder, *overrides):
+    """Return a trainer that goes on without a photograph that the run began with."""
+    scene = tiny_scene()
+    lose_view(*scene, 1)
+    with pytest.warns(UserWarning, match="other views than the 6 of today: the cull mask is dropped"):
+        flags = (*FLAGS, *overrides, "data.allow_missing=true")
+        return make_trainer(folder, *flags, scene=scene, resume=True)
 
 
 @pytest.fixture(scope="module")
@@ -185,8 +192,7 @@ def test_levels_that_follow_footprints_leave_out_what_is_small_in_the_view(tmp_p
 
 
 def _train_on(ranks, folder):
-    trainer = Trainer(tiny_config(*FLAGS), *tiny_scene(), folder, ranks)
-    summary = trainer.train()
+    trainer, summary = train(folder, ranks=ranks)
     return summary["psnr"], trainer.state.progress.gated_views, CULL in trainer.state.table
 
 
@@ -254,15 +260,8 @@ def test_masks_stay_with_their_views_when_a_photograph_is_lost(tmp_path, monkeyp
     stop_at(monkeypatch, 75)
     before, _ = train(tmp_path)
     assert CULL in before.state.table and len(before.state.progress.gated_views) == 7
-    capture, images = tiny_scene()
-    del capture.cameras[1], images.images[1]
-    capture.train, capture.test = [0, 1, 3, 4, 5, 6], [2]
     stop_at(monkeypatch, 78)
-    config = tiny_config(*FLAGS, "data.allow_missing=true")
-    with pytest.warns(
-        UserWarning, match="trained on other views than the 6 of today: the cull mask is dropped"
-    ):
-        fewer = Trainer(config, capture, images, tmp_path, Ranks(), resume=True)
+    fewer = resume_without_a_view(tmp_path)
     assert CULL not in fewer.state.table
     assert fewer.train() is None
     assert len(fewer.state.progress.gated_views) == 6
@@ -277,12 +276,7 @@ def test_a_photograph_that_is_lost_changes_neither_length_nor_opacity_term_of_a_
     stop_at(monkeypatch, 75)
     before, _ = train(tmp_path, *longer)
     monkeypatch.undo()
-    capture, images = tiny_scene()
-    del capture.cameras[1], images.images[1]
-    capture.train, capture.test = [0, 1, 3, 4, 5, 6], [2]
-    config = tiny_config(*FLAGS, *longer, "data.allow_missing=true")
-    with pytest.warns(UserWarning, match="the cull mask is dropped"):
-        fewer = Trainer(config, capture, images, tmp_path, Ranks(), resume=True)
+    fewer = resume_without_a_view(tmp_path, *longer)
     fewer.close()
     assert fewer.state.progress.step == 75
     assert fewer.state.schedule.iterations == before.state.schedule.iterations > 6 * 20
@@ -325,7 +319,3 @@ def test_the_mask_is_cleared_halfway_after_the_last_pass():
     assert cleared(t1=16_000, t2=100_000) == [53_000]  # the run ends before the second pass
     assert cleared(t1=0, t2=0) == []
     assert cleared(t1=16_000, t2=34_000, scale=0.5) == [31_000]
-
-
-def test_a_mask_needs_the_passes():
-    refused(ConfigError, "view.cull: needs population.importance=true", tiny_config, "view.cull=true")

@@ -6,17 +6,19 @@ from __future__ import annotations
 import json
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from blitzgs.capture.colmap import ColmapCamera, ColmapImages, ColmapModel, ColmapPoints, write_model
 from blitzgs.capture.image_files import reduced, reduced_mask
 from blitzgs.capture.images import ImageMemory
 from blitzgs.capture.lengths import near_plane, nearest_depths
@@ -28,6 +30,7 @@ from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_, 
 from blitzgs.ops.projection_types import Views
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.training.trainer import Trainer
+from blitzgs.util.rotations import quaternions
 from tests.helpers import look_at_origin
 
 WIDTH, HEIGHT, COUNT = 48, 32, 400
@@ -94,6 +97,17 @@ class Images:
     def memory(self):
         return ImageMemory(0, 0, 0, 0, 0)
 
+    def lose(self, *indices, error=FileNotFoundError):
+        """Let the reading of these photographs fail, or that of all."""
+        read = self.get
+
+        def get(index, factor=1):
+            if indices and index not in indices:
+                return read(index, factor)
+            raise error(f"/photos/{index:02}.png cannot be read")
+
+        self.get = get
+
 
 def as_flags(*overrides: str) -> list[str]:
     """Return overrides as flags of a command, which takes none twice: of equal fields the last one counts."""
@@ -135,11 +149,7 @@ def photographed(
 ) -> tuple[Capture, Images]:
     """Return a capture of Gaussians: renders from the cameras, and the centres as points.
 
-    Args:
-        truth: the Gaussians.
-        cameras: cameras of the views.
-        test: the view that is held out.
-        extent: radius of the cameras' positions.
+    `test`: the view that is held out. `extent`: radius of the cameras' positions.
     """
     images = []
     for camera in cameras:
@@ -164,19 +174,7 @@ def tiny_scene(scale: float = 1.0) -> tuple[Capture, Images]:
 
 
 def write_tiny_capture(folder: Path) -> None:
-    """Write the capture as transforms.json with PNG images and a point cloud."""
-
-    import cv2
-
-    from blitzgs.capture.colmap import (
-        ColmapCamera,
-        ColmapImages,
-        ColmapModel,
-        ColmapPoints,
-        write_model,
-    )
-    from blitzgs.util.rotations import quaternions
-
+    """Write the capture as a COLMAP model with PNG images."""
     capture, images = tiny_scene()
     (folder / "images").mkdir(parents=True)
     for camera, image in zip(capture.cameras, images.images, strict=True):
@@ -205,12 +203,28 @@ def write_tiny_capture(folder: Path) -> None:
     write_model(folder / "sparse" / "0", model)
 
 
-def train(
-    folder: Path, *overrides: str, scale: float = 1.0, ranks: Ranks | None = None, resume: bool = False
-) -> tuple[Trainer, dict[str, Any] | None]:
-    """Train the tiny capture; return the trainer and its summary, None if it was stopped."""
-    trainer = Trainer(tiny_config(*overrides), *tiny_scene(scale), folder, ranks or Ranks(), resume)
+def make_trainer(
+    folder: Path,
+    *overrides: str,
+    scene: tuple[Capture, Images] | None = None,
+    ranks: Ranks | None = None,
+    resume: bool = False,
+) -> Trainer:
+    """Return a trainer of the tiny capture, or of another one."""
+    return Trainer(tiny_config(*overrides), *(scene or tiny_scene()), folder, ranks or Ranks(), resume)
+
+
+def train(folder: Path, *overrides: str, **how: Any) -> tuple[Trainer, dict[str, Any] | None]:
+    """Train to the end; return the trainer and its summary, None if it was stopped."""
+    trainer = make_trainer(folder, *overrides, **how)
     return trainer, trainer.train()
+
+
+def lose_view(capture: Capture, images: Images, view: int) -> None:
+    """Take a training view from a capture, as if its photograph were missing from the start."""
+    del capture.cameras[view], images.images[view]
+    for part in (capture.train, capture.test):
+        part[:] = [index - (index > view) for index in part if index != view]
 
 
 def at_step(monkeypatch, number: int, action: Callable[[Trainer], object]) -> None:
@@ -253,9 +267,15 @@ def events_of(folder: Path, event: str) -> list[dict[str, Any]]:
     return [record for record in read_log(folder) if record.get("event") == event]
 
 
-def assert_same_table(a: GaussianTable, b: GaussianTable) -> None:
+def sorted_rows(table: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the columns of a table, on the CPU, with the rows in the order of their ids."""
+    order = table["id"].argsort()
+    return {name: table[name][order].cpu() for name in table}
+
+
+def assert_same_table(a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> None:
     """Check that two tables hold the same bits."""
-    assert len(a) == len(b)
+    assert len(a) == len(b) and sorted(a) == sorted(b)
     for name in a:
         assert torch.equal(a[name], b[name]), name
 

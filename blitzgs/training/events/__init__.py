@@ -8,7 +8,7 @@ function in `HANDLERS`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import astuple, replace
+from dataclasses import astuple
 
 from blitzgs.config.schedule import Event, EventKind
 from blitzgs.population.importance import SweepStoppedError
@@ -38,14 +38,14 @@ def handle_all(state: TrainingState, events: Sequence[Event]) -> bool:
     Returns whether all events have run. If not, because a signal stops the run (or the Gaussians do not fit
     into the pool: PoolError), `progress.events_left` holds the others, and a resumed run begins with them.
     """
-    state.progress = replace(state.progress, events_left=[])
+    state.progress.events_left = []
     ordered = sorted(events, key=lambda event: event.kind in ("evaluate", "checkpoint"))
     for done, event in enumerate(ordered):
         try:
             with state.stage(event.kind):
                 HANDLERS[event.kind](state, event)
         except (SweepStoppedError, PoolError) as error:
-            state.progress = replace(state.progress, events_left=[astuple(other) for other in ordered[done:]])
+            state.progress.events_left = [astuple(other) for other in ordered[done:]]
             if isinstance(error, PoolError):
                 raise
             return False

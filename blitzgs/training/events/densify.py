@@ -49,8 +49,7 @@ def run_density_event(state: TrainingState, event: Event) -> None:
         counts["sorted"] = 1
     if moved:
         counts["redistributed"] = 1
-    peak = max(state.progress.peak_gaussians, counts["gaussians"])
-    state.progress = dataclasses.replace(state.progress, peak_gaussians=peak)
+    state.progress.peak_gaussians = max(state.progress.peak_gaussians, counts["gaussians"])
     _log(state, event, counts, limit)
 
 
@@ -70,7 +69,7 @@ def _keep_sorted(state: TrainingState, event: Event, spread_now: int, is_sorted:
         sort_rows(state.table)
         state.stepper.reindex()
         _, spread_now = _over_all_ranks(state, {})
-    state.progress = dataclasses.replace(state.progress, sorted_spread=spread_now)
+    state.progress.sorted_spread = spread_now
     return sorts
 
 

@@ -3,14 +3,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
-from typing import cast
 
 import torch
 from torch import Tensor
 
-from blitzgs.config.fields import ScoreRule
 from blitzgs.config.schedule import Event
 from blitzgs.population.importance import Importance, ViewBatch, sample_by_score, sweep, top_by_score
 from blitzgs.population.redistribution import redistribute
@@ -46,7 +43,7 @@ def run_importance_pass(state: TrainingState, event: Event) -> None:
             subject.options,
             state.ranks,
             state.owners,
-            cast(ScoreRule, state.config.population.score),
+            state.config.population.score,
             subject.lod,
             state.stops,
         )
@@ -63,9 +60,8 @@ def run_importance_pass(state: TrainingState, event: Event) -> None:
     redistribute(state.table, state.ranks, max_imbalance=0)
     sort_rows(state.table)
     state.stepper.reindex()
-    progress = state.progress
-    milestones = progress.milestones | {f"before_{event.kind}": before, f"after_{event.kind}": after}
-    state.progress = dataclasses.replace(progress, milestones=milestones, sorted_spread=0)
+    state.progress.milestones |= {f"before_{event.kind}": before, f"after_{event.kind}": after}
+    state.progress.sorted_spread = 0
     view_level.choose_views(state)
     counts = {"before": before, "gaussians": after, "views": views}
     state.log.event(event.time, event.kind, counts)

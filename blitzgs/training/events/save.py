@@ -7,7 +7,7 @@ import contextlib
 import shlex
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 from blitzgs.config.files import save_config
@@ -108,19 +108,20 @@ def _write(state: TrainingState, in_background: bool = False) -> Saving:
     state.stepper.write_back()
     if state.lineage is not None:
         try:
-            ledger = state.lineage.flush_and_check(state.table["id"], state.progress.step)
+            state.progress.ledger = asdict(
+                state.lineage.flush_and_check(state.table["id"], state.progress.step)
+            )
         except OSError as error:
             raise CheckpointError(
                 f"no checkpoint was written, because {error}.", is_lack_of_space(error)
             ) from error
-        state.progress = replace(state.progress, ledger=asdict(ledger))
     saving = _save(state, state.folder, in_background)
     state.save_clock.restart()
     return saving
 
 
 def _save(state: TrainingState, folder: Path, in_background: bool = False) -> Saving:
-    state.progress = replace(state.progress, curve=asdict(state.curve))
+    state.progress.curve = asdict(state.curve)
     # The division of tiles decides the order of sums, and therefore their last bits.
     shared = state.owners.columns() if state.ranks.world_size > 1 else {}
     if state.stepper.exposures is not None:
