@@ -42,8 +42,7 @@ COMMANDS = {
     "drop_in_full": "python benchmarks/bm_drop_in.py CAPTURE --steps 30000 --one-thread",
     "quality": (
         "python benchmarks/bm_quality.py --out runs/quality --capture NAME=CAPTURE "
-        '--recipe aerial=configs/aerial.yaml --recipe "aerial_half=configs/aerial.yaml --schedule.scale=0.5" '
-        "--seeds 0 1 2"
+        "--recipe aerial=configs/aerial.yaml --recipe compact=configs/compact.yaml --seeds 0 1 2"
     ),
     "city": "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 1 --popping --scale 0.6",
     "city_ranks": (
