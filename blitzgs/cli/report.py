@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 # The model in 3D is read from the checkpoint, beside the model in memory: only up to so many Gaussians.
-_MAX_GAUSSIANS = 2_000_000
+_MAX_GAUSSIANS = 4_000_000
 
 
 def write_final_report(folder: Path, summary: Mapping[str, object] | None) -> None:
