@@ -126,6 +126,28 @@ def test_ablations_keep_the_signals(tmp_path):
     assert PHI not in off.state.table and not pass_events(tmp_path / "b")
 
 
+RELOCATION = ("population.strategy=relocation", "population.pass1_keep=1")
+
+
+@pytest.mark.parametrize(
+    ("flags", "views"),
+    [
+        (("population.pass2_views=8",), (0, 0)),
+        (("population.pass2_mass=1",), (0, 0)),
+        (("population.pass2_views=8", "view.cull=true"), (7, 7)),
+        (("population.pass2_views=7", "population.pass2_mass=1", "population.pass2_keep=0.5"), (0, 7)),
+    ],
+)
+def test_views_are_surveyed_only_for_what_is_used(tmp_path, flags, views):
+    trainer, _ = train(tmp_path, *RELOCATION, *flags)
+    events = [pass_events(tmp_path)[name] for name in ("pass_1", "pass_2")]
+    assert tuple(event["views"] for event in events) == views
+    assert (PHI in trainer.state.table) == any(views)
+    kept = [event["gaussians"] == event["before"] > 0 for event in events]
+    assert kept == [True, "population.pass2_keep=0.5" not in flags]
+    assert trainer.state.progress.milestones["after_pass_2"] == events[1]["gaussians"]
+
+
 def test_the_second_pass_keeps_at_most_a_share(tmp_path):
     flags = ("population.pass1_keep=1", "population.pass2_mass=1", "population.pass2_keep=0.5")
     train(tmp_path, *flags, "population.min_opacity=1e-6")

@@ -26,34 +26,26 @@ LEAST_VIEWS = 4
 def run_importance_pass(state: TrainingState, event: Event) -> None:
     """Score all Gaussians, store phi and the cull mask, prune by the scores and redistribute the rows.
 
-    Errors are NonFiniteError, ModelLostError, and SweepStoppedError if the run has to stop: the pass has then
-    changed nothing.
+    No view is surveyed if all Gaussians are kept and nothing uses phi or the cull matrix. Errors are
+    NonFiniteError, ModelLostError, and SweepStoppedError if the run has to stop: the pass has then changed
+    nothing.
     """
     if not state.config.population.importance:
         return
     state.catch_up()
     check_table(state.table, state.progress.step)
-    views = len(state.capture.train)
-    subject = state.subject()
-    with state.log.work("views surveyed") as report:
-        found = sweep(
-            subject.gaussians,
-            _reported(view_batches(state), report, views),
-            views,
-            subject.options,
-            state.ranks,
-            state.owners,
-            state.config.population.score,
-            subject.lod,
-            state.stops,
-        )
-    found.store(state.table, state.config.view.cull)
-    before = state.population()
-    causes = causes_of_death(state, event, found)
-    if state.lineage is not None:
-        gone = causes.nonzero().squeeze(1)
-        state.lineage.died(state.table["id"][gone], causes[gone], event.time, state.progress.step)
-    state.table.keep(causes == 0)
+    before, views = state.population(), 0
+    # Relocation does not use phi.
+    uses_signals = state.config.view.cull or state.config.population.strategy == "density"
+    if uses_signals or not _keeps_all(state, event):
+        views = len(state.capture.train)
+        found = _surveyed(state, views)
+        found.store(state.table, state.config.view.cull)
+        causes = causes_of_death(state, event, found)
+        if state.lineage is not None:
+            gone = causes.nonzero().squeeze(1)
+            state.lineage.died(state.table["id"][gone], causes[gone], event.time, state.progress.step)
+        state.table.keep(causes == 0)
     after = state.population()
     if after == 0:
         raise ModelLostError(_nothing_kept(state, event, before))
@@ -65,6 +57,32 @@ def run_importance_pass(state: TrainingState, event: Event) -> None:
     view_level.choose_views(state)
     counts = {"before": before, "gaussians": after, "views": views}
     state.log.event(event.time, event.kind, counts)
+
+
+def _surveyed(state: TrainingState, views: int) -> Importance:
+    """Survey all training views. Collective."""
+    subject = state.subject()
+    with state.log.work("views surveyed") as report:
+        return sweep(
+            subject.gaussians,
+            _reported(view_batches(state), report, views),
+            views,
+            subject.options,
+            state.ranks,
+            state.owners,
+            state.config.population.score,
+            subject.lod,
+            state.stops,
+        )
+
+
+def _keeps_all(state: TrainingState, event: Event) -> bool:
+    """Tell whether the configuration lets a pass keep all Gaussians, whatever their scores are."""
+    population = state.config.population
+    if event.kind == "pass_1":
+        return population.pass1_keep == 1
+    few = len(state.capture.train) < population.pass2_views
+    return few or min(population.pass2_mass, population.pass2_keep) == 1
 
 
 def _nothing_kept(state: TrainingState, event: Event, before: int) -> str:
@@ -107,18 +125,16 @@ def causes_of_death(state: TrainingState, event: Event, found: Importance) -> Te
     """Return why a pass prunes each row, uint8 [N] of `Cause`; 0: it is kept. Every rank calls this."""
     population, table, ids = state.config.population, state.table, state.table["id"]
     causes = torch.zeros_like(ids, dtype=torch.uint8)
-    if event.kind == "pass_1":
-        if population.pass1_keep < 1:
-            kept = sample_by_score(
-                found.score, ids, population.pass1_keep, state.config.seed, event.time, state.ranks
-            )
-            causes[~kept] = Cause.PASS_1
+    if _keeps_all(state, event):
         return causes
-    if len(state.capture.train) < population.pass2_views:
+    if event.kind == "pass_1":
+        kept = sample_by_score(
+            found.score, ids, population.pass1_keep, state.config.seed, event.time, state.ranks
+        )
+        causes[~kept] = Cause.PASS_1
         return causes
     # If no Gaussian contributes to any view, the total is zero and no share of it can be kept.
-    total = state.ranks.all_reduce(found.score.double().sum())
-    if min(population.pass2_mass, population.pass2_keep) < 1 and total.item() > 0:
+    if state.ranks.all_reduce(found.score.double().sum()).item() > 0:
         causes[table["opacities"] < opacity_logit(population.min_opacity)] = Cause.LATE_OPACITY
         kept = top_by_score(found.score, ids, population.pass2_mass, population.pass2_keep, state.ranks)
         causes[~kept] = Cause.PASS_2
