@@ -288,8 +288,7 @@ void project(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::in
 // writes colors, opacities, radii and tiles_touched; other columns may be null. It does nothing if there are
 // more splats than the capacity. On the CPU the sizes of the capacity are the actual numbers.
 template <class T>
-void color_splats(const ProjectInputs<T>&, const ProjectCapacity&, const ProjectColumns<T>&, Workspace&,
-                  CudaStream);
+void color_splats(const ProjectInputs<T>&, const ProjectCapacity&, const ProjectColumns<T>&, CudaStream);
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientSource<T>&,
                  const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream);

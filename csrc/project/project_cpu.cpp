@@ -209,7 +209,7 @@ void project(const ProjectInputs<T>& in, const RankTiles& rank_tiles, SplatMemor
 
 template <class T>
 void color_splats(const ProjectInputs<T>& in, const ProjectCapacity& capacity,
-                  const ProjectColumns<T>& columns, Workspace&, CudaStream) {
+                  const ProjectColumns<T>& columns, CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
   const ProjectOutputs<T>& out = columns.values;
   parallel_rows(capacity.sizes.splats, 1 << 10, [&](std::int64_t i) {
@@ -254,7 +254,7 @@ void zero_arrays(const ZeroedArrays<T>& arrays, CudaStream) {
   template void project<T>(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t*,       \
                            Workspace&, CudaStream);                                                         \
   template void color_splats<T>(const ProjectInputs<T>&, const ProjectCapacity&, const ProjectColumns<T>&,  \
-                                Workspace&, CudaStream);                                                    \
+                                CudaStream);                                                                \
   template void project_bwd<T>(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&,  \
                                const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream); \
   template void zero_arrays<T>(const ZeroedArrays<T>&, CudaStream);

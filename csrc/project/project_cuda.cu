@@ -236,7 +236,7 @@ void project<float>(const Inputs& in, const RankTiles& rank_tiles, SplatMemory<f
 
 template <>
 void color_splats<float>(const Inputs& in, const ProjectCapacity& capacity,
-                         const ProjectColumns<float>& columns, Workspace&, CudaStream stream) {
+                         const ProjectColumns<float>& columns, CudaStream stream) {
   write_colors(in, capacity, columns, stream);
 }
 
