@@ -253,8 +253,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def("draw_weights(Tensor opacities, Tensor causes) -> Tensor");
   m.def(
       "residual_draws(Tensor weights, Tensor ids, int draws, int total, int seed, int event) -> (Tensor "
-      "whole, "
-      "Tensor keys)");
+      "whole, Tensor keys)");
   m.def("overlap(Tensor opacities, Tensor copies) -> Tensor");
   m.def(
       "share_rows_(Tensor(a!) opacities, Tensor(b!) scales, Tensor(c!)[] moments, Tensor rows, "

@@ -160,14 +160,14 @@ void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Worksp
   });
 }
 
-void seen_blocks(const SeenBlocks& args, Workspace&, CudaStream) {
+void seen_blocks(const SeenBlocks& args, CudaStream) {
   Frustum planes[kMaxViews];
   for (int view = 0; view < args.views; ++view) planes[view] = frustum_of(args, view);
   parallel_rows(args.n, 1024,
                 [&](std::int64_t block) { args.seen[block] = views_that_see(args, planes, block); });
 }
 
-void swap_blocks(const SwapBlocks& swap, Workspace&, CudaStream) {
+void swap_blocks(const SwapBlocks& swap, CudaStream) {
   parallel_rows(swap.n, 4, [&](std::int64_t i) {
     for (int c = 0; c < swap.n_columns; ++c) {
       const SwapColumn& column = swap.columns[c];
@@ -197,7 +197,7 @@ void rows_of_sectors(const CullMask& mask, CudaStream) {
   });
 }
 
-void gate_views(const ViewGateArgs& args, Workspace&, CudaStream) {
+void gate_views(const ViewGateArgs& args, CudaStream) {
   GateTable table = args.rules.table;
   for (int view = 0; view < args.rules.n_views; ++view)
     camera_centre(args.viewmats + 16 * view, table.centres[view]);

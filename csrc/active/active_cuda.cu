@@ -129,13 +129,13 @@ __global__ void __launch_bounds__(kThreads, kResident) gate_views_kernel(const V
 
 }  // namespace
 
-void seen_blocks(const SeenBlocks& args, Workspace&, CudaStream stream) {
+void seen_blocks(const SeenBlocks& args, CudaStream stream) {
   if (args.n == 0) return;
   see_blocks<<<blocks_for(args.n, kThreads), kThreads, 0, stream>>>(args);
   check_launch("seen_blocks");
 }
 
-void swap_blocks(const SwapBlocks& given, Workspace&, CudaStream stream) {
+void swap_blocks(const SwapBlocks& given, CudaStream stream) {
   if (given.n == 0 || given.n_columns == 0) return;
   SwapBlocks swap = given;
   std::int64_t units = 0;
@@ -161,7 +161,7 @@ void swap_blocks(const SwapBlocks& given, Workspace&, CudaStream stream) {
 void sectors_of_rows(const CullMask& mask, CudaStream stream) { transpose<true>(mask, stream); }
 void rows_of_sectors(const CullMask& mask, CudaStream stream) { transpose<false>(mask, stream); }
 
-void gate_views(const ViewGateArgs& args, Workspace&, CudaStream stream) {
+void gate_views(const ViewGateArgs& args, CudaStream stream) {
   if (args.capacity == 0) return;
   // The grid is limited because the list's capacity is the whole table and its valid entries are few.
   const std::int64_t most = kResident * multiprocessors();

@@ -193,7 +193,7 @@ void gate_views_(const Tensor& ids_in, const Tensor& views_in, const std::option
   DeviceScope scope(views);
   backend::gate_views({ids, views, max_listed(kOp, count, capacity), data_or_null<std::int32_t>(count), means,
                        viewmats, held.rules},
-                      scope.workspace, scope.stream);
+                      scope.stream);
 }
 
 Tensor seen_blocks(const Tensor& bounds_in, const Tensor& viewmats_in, const Tensor& Ks_in,
@@ -209,7 +209,7 @@ Tensor seen_blocks(const Tensor& bounds_in, const Tensor& viewmats_in, const Ten
   backend::seen_blocks(
       {bounds, bounds.size(0), viewmats, Ks, sizes, static_cast<int>(views), static_cast<float>(near_plane),
        static_cast<float>(far_plane), static_cast<float>(eps2d), seen},
-      scope.workspace, scope.stream);
+      scope.stream);
   return seen;
 }
 
@@ -249,7 +249,7 @@ void swap_blocks_(const std::vector<Tensor>& pool, const std::vector<Tensor>& ta
   }
   if (swap.n == 0 || n_columns == 0) return;
   DeviceScope scope(slots);
-  backend::swap_blocks(swap, scope.workspace, scope.stream);
+  backend::swap_blocks(swap, scope.stream);
 }
 
 Tensor morton_keys(const Tensor& points) {

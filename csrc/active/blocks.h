@@ -9,22 +9,20 @@
 // and its log scales between two values.
 //
 // A box of means with standard deviations up to sigma is dropped from a view iff all its points fail one of
-// the linear inequalities n . p + d + k sigma >= 0 of the view's frustum (math/frustum.h). Blocks are tested
-// first. Then the rows of the remaining blocks are tested by the same inequalities, each with the box of its
-// own line. The test of a block has twice the rounding slack, so a row that passes its own test is never
-// dropped with its block, and the result does not depend on how rows are grouped. If the box of a block
-// satisfies all inequalities with sigma = 0 and some slack, all its rows pass without being read. Only the
-// rows of mixed blocks, which lie across a border of a view, are read.
+// the inequalities of the view's frustum (math/frustum.h). Blocks are tested first, then the rows of the
+// remaining blocks, each with the box of its own line. The test of a block has twice the rounding slack, so a
+// row that passes its own test is never dropped with its block, and the result does not depend on how rows
+// are grouped. If the box of a block satisfies all inequalities with sigma = 0 and some slack, all its rows
+// pass without being read. Only the rows of mixed blocks, which lie across a border of a view, are read.
 //
 // A gate on the views (view_gate.h) drops rows by the same principle: the distances of a box from the camera
 // decide first for blocks and then for rows. A row for which they do not decide stays active; the exact test
-// follows when the row has caught up. A cull mask (view_gate.h) that drops all rows of a block drops the
-// block without reading its rows.
+// follows when the row has caught up.
 //
-// The test is conservative: every row that the projection would project is in the set
-// (tests/table/test_blocks.py). The cost is O(N / 256 + rows of mixed blocks + active rows) per view, the
-// memory O(rows of the blocks that some view may see). The caller gives the capacity in blocks. If more
-// blocks are active, the lists are empty and n_blocks says how large the capacity has to be.
+// The test is conservative: every row that the projection would project is in the set. The cost is O(N / 256
+// + rows of mixed blocks + active rows) per view, the memory O(rows of the blocks that some view may see).
+// The caller gives the capacity in blocks. If more blocks are active, the lists are empty and n_blocks says
+// how large the capacity has to be.
 #pragma once
 #include <cfloat>
 #include <cmath>

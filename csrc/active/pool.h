@@ -68,8 +68,8 @@ BLITZGS_HD Frustum frustum_of(const SeenBlocks& args, int view) {
 }
 
 namespace BLITZGS_BACKEND {
-void seen_blocks(const SeenBlocks&, Workspace&, CudaStream);
-void swap_blocks(const SwapBlocks&, Workspace&, CudaStream);
+void seen_blocks(const SeenBlocks&, CudaStream);
+void swap_blocks(const SwapBlocks&, CudaStream);
 }  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -77,9 +77,6 @@ void rows_of_sectors(const CullMask&, CudaStream);
 // The op clears the bits of dropped pairs in `views`, in place. The decision for a row depends on this row
 // alone, in float32 and from caught-up means, so the sets depend neither on the order of the rows nor on how
 // they are divided among ranks. One thread handles a row: deterministic. The cost is O(listed rows).
-//
-// ids int32 [capacity] and views int32 [capacity], of which the first count [1] are valid; means [N, 3];
-// level uint8 [N]; viewmats [B, 4, 4], rigid; cull int32 [ceil(N / 256), columns, 8].
 
 // The values that the rows of a launch are compared with, by view or by level.
 struct GateTable {
@@ -102,12 +99,12 @@ struct GateRules {
 BLITZGS_HD bool leaves_out_any(const GateRules& rules) { return (rules.lod_views | rules.cull_views) != 0; }
 
 struct ViewGateArgs {
-  const std::int32_t* ids;
-  std::int32_t* views;
+  const std::int32_t* ids;  // [capacity]
+  std::int32_t* views;      // [capacity]
   std::int64_t capacity;
   const std::int32_t* count;  // CUDA: the number of valid ids, in device memory; null: all
-  const float* means;
-  const float* viewmats;
+  const float* means;         // [N, 3]
+  const float* viewmats;      // [B, 4, 4], rigid
   GateRules rules;
 };
 
@@ -164,7 +161,7 @@ BLITZGS_HD void gate_entry(const ViewGateArgs& args, const GateTable& table, std
 }
 
 namespace BLITZGS_BACKEND {
-void gate_views(const ViewGateArgs&, Workspace&, CudaStream);
+void gate_views(const ViewGateArgs&, CudaStream);
 }  // namespace BLITZGS_BACKEND
 
 // Fills `table` with the table of the rules and the camera centres. All threads of a block call this, each

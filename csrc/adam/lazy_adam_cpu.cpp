@@ -3,7 +3,7 @@
 #include <type_traits>
 
 #include "adam/lazy_adam.h"
-#include "adam/lazy_adam_lanes.h"
+#include "adam/lazy_adam_row.h"
 #include "common/parallel.h"
 
 namespace blitzgs::cpu {
@@ -15,7 +15,7 @@ AdamRowUpdate<T> row_update() {
   if constexpr (std::is_same_v<T, float>) {
     if (use_avx2()) return avx2_adam_row_update();
   }
-  return update_row<PlainLanes<T>, T>;
+  return update_row<T>;
 }
 
 // The rows of a list are scattered in memory, so a row's state is prefetched while the rows before it are
@@ -68,10 +68,14 @@ void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream) {
     for (std::int64_t i = begin; i < end; ++i) {
       const std::int64_t row = args.row(i);
       prefetch_row(args, args.row(std::min(i + kPrefetchDistance, end - 1)));
-      const AdamRow<T> state = adam_row(args, row);
-      if (!with_gradient && state.from >= target) continue;
-      const PendingSteps<T>* steps = state.moves ? &pending.get(args, state.from, target) : nullptr;
-      if (with_gradient || steps) update({args, step, state, steps, adam_explicit_drift<T>, row, i});
+      const std::int32_t from = args.last_step[row], stand = args.moment_step[row];
+      if (!with_gradient && from >= target) continue;
+      const PendingSteps<T>* steps =
+          adam_moves(args, from, stand) ? &pending.get(args, from, target) : nullptr;
+      if (with_gradient || steps) {
+        update({args, step, steps, adam_explicit_drift<T>, row, i, args.table_row(from - stand),
+                args.table_row(target - stand)});
+      }
       args.last_step[row] = args.step;
       if (with_gradient) args.moment_step[row] = args.step;
     }

@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 // All that is compiled with AVX2 and FMA; use_avx2() (parallel.h) tells where it may be called.
-#include "adam/lazy_adam_lanes.h"
+#include "adam/lazy_adam_row.h"
 #include "loss/photometric_strip.h"
 #include "rasterize/tile_kernels.h"
 
 namespace blitzgs::cpu {
 
-AdamRowUpdate<float> avx2_adam_row_update() { return update_row<Avx2Lanes, float>; }
+AdamRowUpdate<float> avx2_adam_row_update() { return update_row<float>; }
 
 void photometric_strips_avx2(const PhotometricArgs<float>& args, const std::int64_t* strips,
                              std::int64_t begin, std::int64_t end, double* sums) {

@@ -49,7 +49,7 @@ void scatter(const ScatterSplats& splats, const SplatGroups& groups, const Scatt
 }
 
 void gather(const std::int32_t* packed, const SplatGroups& groups, const SplatColumns<std::int32_t>& columns,
-            Workspace&, CudaStream) {
+            CudaStream) {
   const std::int64_t total = columns.begin[columns.count];
   for (int m = 0; m < groups.count; ++m) {
     for (int c = 0; c < columns.count; ++c) {
@@ -61,7 +61,7 @@ void gather(const std::int32_t* packed, const SplatGroups& groups, const SplatCo
 }
 
 template <class T>
-void sum(const SplatValues<T>& in, const SplatColumns<T>& out, Workspace&, CudaStream) {
+void sum(const SplatValues<T>& in, const SplatColumns<T>& out, CudaStream) {
   for (int c = 0; c < out.count; ++c) {
     std::fill_n(out.data[c], in.count * (out.begin[c + 1] - out.begin[c]), T(0));
   }
@@ -75,8 +75,8 @@ void sum(const SplatValues<T>& in, const SplatColumns<T>& out, Workspace&, CudaS
   });
 }
 
-template void sum<float>(const SplatValues<float>&, const SplatColumns<float>&, Workspace&, CudaStream);
-template void sum<double>(const SplatValues<double>&, const SplatColumns<double>&, Workspace&, CudaStream);
+template void sum<float>(const SplatValues<float>&, const SplatColumns<float>&, CudaStream);
+template void sum<double>(const SplatValues<double>&, const SplatColumns<double>&, CudaStream);
 
 namespace {
 

@@ -41,6 +41,20 @@ void add_column(const char* op, SplatColumns<Word>& columns, Word* data, std::in
   columns.begin[++columns.count] = static_cast<int>(end);
 }
 
+// Makes a column of `splats` splats for each of the widths and appends it.
+template <class Word>
+std::vector<Tensor> make_columns(const char* op, SplatColumns<Word>& columns, const Tensor& like,
+                                 std::int64_t splats, const std::vector<std::int64_t>& widths) {
+  std::vector<Tensor> found;
+  for (const std::int64_t width : widths) {
+    BLITZGS_CHECK(width >= 0, op, "widths must not be negative, got ", width);
+    const auto column = make<Word>(like, {splats, width});
+    found.push_back(column);
+    add_column(op, columns, column.data(), width);
+  }
+  return found;
+}
+
 // Columns int32 [P, w] and masks int64 [P]; keeps the contiguous forms alive.
 struct HeldSplats {
   HeldSplats(const char* op, const std::vector<Tensor>& columns, const Tensor& masks_in)
@@ -90,17 +104,11 @@ std::vector<Tensor> gather_splats(const Tensor& packed, const std::vector<std::i
   constexpr const char* kOp = "gather_splats";
   const SplatGroups groups = checked_groups(kOp, "group_sizes", group_sizes);
   const std::int64_t n_splats = total_splats(groups);
-  std::vector<Tensor> found;
   SplatColumns<std::int32_t> columns{};
-  for (const std::int64_t width : widths) {
-    BLITZGS_CHECK(width >= 0, kOp, "widths must not be negative, got ", width);
-    const auto column = make<std::int32_t>(packed, {n_splats, width});
-    found.push_back(column);
-    add_column(kOp, columns, column.data(), width);
-  }
+  std::vector<Tensor> found = make_columns(kOp, columns, packed, n_splats, widths);
   const auto words = checked<std::int32_t>(kOp, "packed", packed, {n_splats * columns.begin[columns.count]});
   DeviceScope scope(words);
-  if (columns.count > 0) backend::gather(words, groups, columns, scope.workspace, scope.stream);
+  if (columns.count > 0) backend::gather(words, groups, columns, scope.stream);
   return found;
 }
 
@@ -114,18 +122,11 @@ std::vector<Tensor> sum_splats(const Tensor& values, const Tensor& places,
   const auto held = checked_places(kOp, places, splats, groups.count);
   DeviceScope scope(values);
   return dispatch_floating(values, [&]<class T>() {
-    std::vector<Tensor> sums;
     SplatColumns<T> columns{};
-    for (const std::int64_t width : widths) {
-      BLITZGS_CHECK(width >= 0, kOp, "widths must not be negative, got ", width);
-      const auto sum = make<T>(values, {splats, width});
-      sums.push_back(sum);
-      add_column(kOp, columns, sum.data(), width);
-    }
+    std::vector<Tensor> sums = make_columns(kOp, columns, values, splats, widths);
     const int width = columns.begin[columns.count];
     const auto contiguous = checked<T>(kOp, "values", values, {total_splats(groups), width});
-    backend::sum(SplatValues<T>{contiguous, width, splats, places_in(held), groups}, columns, scope.workspace,
-                 scope.stream);
+    backend::sum(SplatValues<T>{contiguous, width, splats, places_in(held), groups}, columns, scope.stream);
     return sums;
   });
 }
@@ -180,8 +181,7 @@ void device_barrier(const std::vector<Tensor>& control, std::int64_t rank, std::
   for (std::int64_t m = 0; m < count; ++m) words.of[m] = mutable_data<std::int64_t>(control[m]);
   DeviceScope scope(control[rank]);
   cuda::device_barrier(words, number, data_or_null<std::int64_t>(values), static_cast<int>(n_values), first,
-                       timeout_seconds, host ? mutable_data<std::int64_t>(*host) : nullptr, scope.workspace,
-                       scope.stream);
+                       timeout_seconds, host ? mutable_data<std::int64_t>(*host) : nullptr, scope.stream);
 }
 
 void copy_to_host(const Tensor& host, const Tensor& values_in) {

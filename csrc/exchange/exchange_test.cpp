@@ -44,7 +44,7 @@ TEST_CASE("scattered splats arrive in order, and their sums return", "[scatter]"
                workspace, nullptr);
 
   std::vector<std::int32_t> a2(2 * total), b2(total);
-  cpu::gather(packed.data(), groups, {{a2.data(), b2.data()}, {0, 2, 3}, 2}, workspace, nullptr);
+  cpu::gather(packed.data(), groups, {{a2.data(), b2.data()}, {0, 2, 3}, 2}, nullptr);
   std::size_t at = 0;
   for (int m = 0; m < n_ranks; ++m) {
     for (int i = 0; i < n; ++i) {
@@ -63,7 +63,7 @@ TEST_CASE("scattered splats arrive in order, and their sums return", "[scatter]"
     values[3 * i + 2] = 2 * weight;
   }
   cpu::sum<double>({values.data(), 3, n, places.data(), groups}, {{x.data(), y.data()}, {0, 1, 3}, 2},
-                   workspace, nullptr);
+                   nullptr);
   for (int i = 0; i < n; ++i) {
     const double weight = (masks[i] & 1 ? 1.0 : 0.0) + (masks[i] & 4 ? 10.0 : 0.0);
     REQUIRE(x[i] == weight * b[i]);

@@ -95,10 +95,9 @@ struct SplatValues {
 namespace BLITZGS_BACKEND {
 void scatter(const ScatterSplats&, const SplatGroups&, const ScatterTargets&, SplatPlace* places, Workspace&,
              CudaStream);
-void gather(const std::int32_t* packed, const SplatGroups&, const SplatColumns<std::int32_t>&, Workspace&,
-            CudaStream);
+void gather(const std::int32_t* packed, const SplatGroups&, const SplatColumns<std::int32_t>&, CudaStream);
 template <class T>
-void sum(const SplatValues<T>&, const SplatColumns<T>&, Workspace&, CudaStream);
+void sum(const SplatValues<T>&, const SplatColumns<T>&, CudaStream);
 }  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -107,7 +107,7 @@ void scatter(const ScatterSplats& splats, const SplatGroups& groups, const Scatt
 }
 
 void gather(const std::int32_t* packed, const SplatGroups& groups, const SplatColumns<std::int32_t>& columns,
-            Workspace&, CudaStream stream) {
+            CudaStream stream) {
   const std::int64_t most = *std::max_element(groups.size, groups.size + groups.count);
   if (most == 0) return;
   const dim3 grid(std::min(1024u, blocks_for(most, 256)), groups.count * columns.count);
@@ -116,7 +116,7 @@ void gather(const std::int32_t* packed, const SplatGroups& groups, const SplatCo
 }
 
 template <>
-void sum<float>(const SplatValues<float>& in, const SplatColumns<float>& out, Workspace&, CudaStream stream) {
+void sum<float>(const SplatValues<float>& in, const SplatColumns<float>& out, CudaStream stream) {
   if (in.count == 0 || in.width == 0) return;
   const unsigned blocks = blocks_for(in.count, kSumThreads);
   if (in.width == kSplatValues) {

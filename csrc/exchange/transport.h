@@ -4,8 +4,8 @@
 //
 // send_splats_ writes each splat to the buffers of the ranks in its rank mask. In each buffer the splats of
 // this rank follow those of the ranks before it, and column c begins at word
-// capacity * kSentColumns.begin[c]. If any rank has, sends or receives more than `capacity` splats, no rank
-// writes any. All ranks decide this alike, because they have the same totals.
+// capacity * kSentColumns.begin[c]. If any rank has, sends or receives more than `capacity` splats, which all
+// see in the totals, no rank writes any.
 //
 // The gradients need no op for their way back: in the projection's backward pass the owner of the splats
 // reads them from the tables of the ranks that composited the splats (RankSplatGradients, project/project.h).
@@ -55,7 +55,7 @@ struct SendArguments {
 namespace cuda {
 // host: null, or pinned memory.
 void device_barrier(const ControlWords&, std::int64_t number, const std::int64_t* values, int n_values,
-                    std::int64_t first, double timeout_seconds, std::int64_t* host, Workspace&, CudaStream);
+                    std::int64_t first, double timeout_seconds, std::int64_t* host, CudaStream);
 void send_splats(const SendArguments&, CudaStream);
 
 // The address at which kernels of the current device access pinned memory of the host. Throws if the memory

@@ -196,7 +196,7 @@ void copy_to_host(const std::int64_t* values, std::int64_t n, std::int64_t* host
 }
 
 void device_barrier(const ControlWords& control, std::int64_t number, const std::int64_t* values,
-                    int n_values, std::int64_t first, double timeout_seconds, std::int64_t* host, Workspace&,
+                    int n_values, std::int64_t first, double timeout_seconds, std::int64_t* host,
                     CudaStream stream) {
   const auto timeout = static_cast<std::uint64_t>(1e9 * timeout_seconds);
   barrier_kernel<<<1, kBarrierThreads, 0, stream>>>(control, number, values, n_values, first, timeout,

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The contributions of splats to the image, for the importance pass (BlitzGS, section 3.2: w = sum of
-// alpha T, a = number of pixels). Compositing is that of rasterize/rasterize.h, without colours. The sums of
-// a splat are over the pixels at which it is composited:
+// The contributions of splats to the image, for the importance pass (BlitzGS, section 3.2), by the
+// compositing of rasterize/rasterize.h. The sums of a splat are over the pixels at which it is composited:
 //   weights = sum of u, u = round(2^32 alpha T)   int64 [P], u to the nearest integer, ties to even
 //   pixels  = number of these pixels              int32 [P]
 //   squares = sum of floor(u^2 / 2^32)            int64 [P], which is (alpha T)^2 in the same units; optional

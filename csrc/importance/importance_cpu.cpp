@@ -14,13 +14,8 @@ void contributions(const RasterizeInput<T>& in, const ContributionSums& sums, Wo
   std::fill_n(sums.weights, in.n_splats, 0);
   std::fill_n(sums.pixels, in.n_splats, 0);
   if (sums.squares) std::fill_n(sums.squares, in.n_splats, 0);
-  const PreparedSplat<T>* splats = pack_splats(in, allocate_splats<T>(in.n_splats, workspace));
-  const TileKernels<T> kernels = tile_kernels<T>(0, false);
-  const TileMemory<T> memory(in, workspace);
-  parallel_tasks(in.grid.tile_end - in.grid.tile_begin, [&](std::int64_t task, int worker) {
-    TileJob<T> job = make_job(in, splats, in.grid.tile_begin + task);
-    memory.lend(worker, &job);
-    kernels.contribute(job, sums);
+  for_each_colorless_tile(in, workspace, [&](const TileKernels<T>& kernels, const TileJob<T>& tile) {
+    kernels.contribute(tile, sums);
   });
 }
 

@@ -117,10 +117,8 @@ BLITZGS_HD MassSearch search_of_ids(const MassSearch& weight) {
   return {0, 0, weight.held / weight.head > wanted ? wanted : 0, 0};
 }
 
-BLITZGS_HD std::int64_t id_key(std::int64_t id) { return std::numeric_limits<std::int64_t>::max() - id; }
-
 BLITZGS_HD std::int64_t id_key_of(const MassCutArgs& args, std::int64_t item) {
-  return id_key(args.ids[args.owners[item]]);
+  return std::numeric_limits<std::int64_t>::max() - args.ids[args.owners[item]];
 }
 
 // The summand of an item in a scan: `amount`, to the sum of `digit`. adds: whether the item's earlier digits

@@ -1,9 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
 #include <array>
-#include <bit>
-#include <cstddef>
-#include <type_traits>
+#include <atomic>
 #include <vector>
 
 #include "common/parallel.h"
@@ -20,22 +18,13 @@ struct Span {
 };
 
 template <class T>
-using KeyOf = std::conditional_t<sizeof(T) == 4, std::uint32_t, std::uint64_t>;
+using KeyOf = decltype(ordered_bits(T()));
 
 template <class Key>
 struct Keyed {
   Key key;
   std::int32_t splat;
 };
-
-// Maps floats to unsigned integers of the same order.
-template <class T>
-KeyOf<T> depth_key(T depth) {
-  using Key = KeyOf<T>;
-  constexpr Key kSign = Key(1) << (8 * sizeof(Key) - 1);
-  const Key bits = std::bit_cast<Key>(depth);
-  return bits & kSign ? ~bits : bits | kSign;
-}
 
 template <class T, class F>
 void for_each_span(const IntersectInput<T>& in, std::int32_t splat, const F& f) {
@@ -115,7 +104,7 @@ const Keyed<KeyOf<T>>* sort_splats(const IntersectInput<T>& in, Workspace& works
   auto* spare = workspace.allocate<Keyed<Key>>(in.n_splats);
   parallel_for(0, in.n_splats, 1 << 14, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t i = begin; i < end; ++i)
-      splats[i] = {depth_key(in.depths[i]), static_cast<std::int32_t>(i)};
+      splats[i] = {ordered_bits(in.depths[i]), static_cast<std::int32_t>(i)};
   });
   for (int shift = 0; shift < static_cast<int>(8 * sizeof(Key)); shift += 11) {
     if (radix_pass(splats, spare, in.n_splats, shift)) std::swap(splats, spare);
@@ -136,18 +125,14 @@ int choose_pieces(std::int64_t n_tiles) {
 
 template <class T>
 std::int64_t count_intersections(const IntersectInput<T>& in, Workspace&, CudaStream) {
-  const int pieces = num_threads();
-  std::vector<std::int64_t> counts(pieces, 0);
-  parallel_pieces(pieces, [&](int piece) {
+  std::atomic<std::int64_t> total{0};
+  parallel_for(0, in.n_splats, 1 << 12, [&](std::int64_t begin, std::int64_t end) {
     std::int64_t count = 0;
-    const std::int64_t end = piece_start(in.n_splats, pieces, piece + 1);
-    for (std::int64_t splat = piece_start(in.n_splats, pieces, piece); splat < end; ++splat) {
+    for (std::int64_t splat = begin; splat < end; ++splat) {
       for_each_span(in, static_cast<std::int32_t>(splat), [&](std::int64_t, std::int32_t n) { count += n; });
     }
-    counts[piece] = count;
+    total += count;
   });
-  std::int64_t total = 0;
-  for (const std::int64_t count : counts) total += count;
   return total;
 }
 

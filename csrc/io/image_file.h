@@ -57,11 +57,7 @@ std::vector<std::uint8_t> read_image_file(const std::string& path);
 void check_jpeg(ImageBytes file, const std::string& name);
 
 // The QOI image format (qoiformat.org), RGB only: lossless, about the size of PNG, decoded several times
-// faster.
-//
-// A file is a 14-byte header, one code of 1 to 4 bytes for each pixel or run of up to 62 equal pixels, and 8
-// bytes that mark the end. Codes: a recent pixel by its hash, a small difference to the pixel before, a
-// difference in which red and blue follow green, a run, or the pixel itself. O(pixels), deterministic.
+// faster. O(pixels), deterministic.
 struct QoiSize {
   std::uint32_t width;
   std::uint32_t height;

@@ -114,20 +114,6 @@ TEST_CASE("bytes after the last block are skipped as decoders do, if they are no
   REQUIRE(mentions(jpeg(16, 8, {0x3f, 0xfe, 0xff, 0xd0, 0x3f}, 0xc0, 1), "go on after the last block"));
 }
 
-TEST_CASE("a JPEG without Huffman tables has the standard ones") {
-  const auto bare = [](const Bytes& data, std::uint8_t tables) {
-    Bytes out = {0xff, 0xd8};
-    append(out, segment(0xc0, {8, 0, 16, 0, 16, 1, 1, 0x11, 0}));
-    append(out, segment(0xda, {1, 1, tables, 0, 63, 0}));
-    append(out, data);
-    append(out, {0xff, 0xd9});
-    return out;
-  };
-  // A flat block is 00 and 1010 in the tables of brightness, 00 and 00 in those of colour.
-  REQUIRE((problem(bare({0x28, 0xa2, 0x8a}, 0x00)).empty() && problem(bare({0x00, 0x00}, 0x11)).empty()));
-  REQUIRE(mentions(bare({0x28}, 0x00), "image data end before the last block"));
-}
-
 TEST_CASE("cut JPEGs are refused wherever they end") {
   for (const std::uint8_t frame : {0xc0, 0xc2}) {
     const Bytes file = jpeg(16, 16, {0x00, 0x00, 0x00, 0x00}, frame);

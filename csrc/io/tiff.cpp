@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // TIFF and BigTIFF: the first directory of a file.
 #include <algorithm>
-#include <cstring>
 
 #include "io/image_file.h"
 

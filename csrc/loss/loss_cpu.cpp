@@ -66,7 +66,7 @@ template void photometric<float>(const PhotometricArgs<float>&, Workspace&, Cuda
 template void photometric<double>(const PhotometricArgs<double>&, Workspace&, CudaStream);
 
 template <class T>
-void report(const Report<T>& report, Workspace&, CudaStream) {
+void report(const Report<T>& report, CudaStream) {
   for (std::int64_t view = 0; view < report.views; ++view) {
     const double* parts = report.parts + 2 * view * report.n_parts;
     double l1 = 0, ssim = 0;
@@ -83,17 +83,17 @@ void report(const Report<T>& report, Workspace&, CudaStream) {
   }
 }
 
-template void report<float>(const Report<float>&, Workspace&, CudaStream);
-template void report<double>(const Report<double>&, Workspace&, CudaStream);
+template void report<float>(const Report<float>&, CudaStream);
+template void report<double>(const Report<double>&, CudaStream);
 
 template <class T>
-void loss_of_sums(const LossOfSums<T>& args, Workspace&, CudaStream) {
+void loss_of_sums(const LossOfSums<T>& args, CudaStream) {
   double l1 = 0, ssim = 0;
   for (std::int64_t i = 0; i < args.n; ++i) l1 += args.parts[2 * i], ssim += args.parts[2 * i + 1];
   *args.loss = static_cast<T>(args.offset + args.l1_weight * l1 + args.ssim_weight * ssim);
 }
 
-template void loss_of_sums<float>(const LossOfSums<float>&, Workspace&, CudaStream);
-template void loss_of_sums<double>(const LossOfSums<double>&, Workspace&, CudaStream);
+template void loss_of_sums<float>(const LossOfSums<float>&, CudaStream);
+template void loss_of_sums<double>(const LossOfSums<double>&, CudaStream);
 
 }  // namespace blitzgs::cpu

@@ -110,7 +110,7 @@ std::tuple<Tensor, Tensor> photometric_fwd(const Tensor& renders, const Tensor& 
     const auto l1_sums = make<T>(renders, {views}), ssim_sums = make<T>(renders, {views});
     const Report<T> report{
         data<double>(parts), views, parts.size(1), nullptr, 0, 0, {{l1_sums, ssim_sums, nullptr}}, 1};
-    backend::report(report, scope.workspace, scope.stream);
+    backend::report(report, scope.stream);
     return {l1_sums, ssim_sums};
   });
 }
@@ -147,7 +147,7 @@ std::tuple<Tensor, Tensor> l1_ssim_fwd_bwd(const Tensor& renders, const Tensor& 
   return dispatch_floating(renders, [&]<class T>() -> std::tuple<Tensor, Tensor> {
     const auto loss = make<T>(renders, {});
     backend::loss_of_sums(LossOfSums<T>{data<double>(out.parts), n, l1_factor, ssim_factor, offset, loss},
-                          scope.workspace, scope.stream);
+                          scope.stream);
     return {loss, out.v_renders};
   });
 }
@@ -172,7 +172,7 @@ void report_(const std::optional<Tensor>& parts_in, const std::optional<Tensor>&
     report.targets[report.n_targets++] = {mine, mine + report.views, sums + 2 * report.views * n_ranks};
   }
   DeviceScope scope(parts ? *parts : tile_work ? *tile_work : targets[0]);
-  backend::report(report, scope.workspace, scope.stream);
+  backend::report(report, scope.stream);
 }
 
 }  // namespace

@@ -1,10 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// The photometric loss (docs/image.md, Loss; Kerbl et al. 2023, Eq. 7): fused L1 and SSIM of rendered views
-// against their images, and the gradient by the renders.
+// The photometric loss (docs/image.md, Loss; Kerbl et al. 2023, Eq. 7): fused L1 and SSIM (Wang et al. 2004)
+// of rendered views against their images, and the gradient by the renders.
 //
-//   l1[b]   = sum over owned, unmasked pixels and channels of |x - y|
-//   ssim[b] = sum over the same of SSIM(x, y), Wang et al. 2004: 11 x 11 Gaussian window, sigma 1.5, zero
-//             padding, C1 = 0.01^2, C2 = 0.03^2
+//   l1[b], ssim[b] = sums of |x - y| and of SSIM(x, y) over owned, unmasked pixels and channels
 //
 // x renders [B, H, W, 3]; y targets of the same shape, uint8 (value / 255) or the dtype of x; masks uint8
 // [B, H, W], 0 = excluded from the sums (windows centred at other pixels still read the pixel). The caller
@@ -20,11 +18,9 @@
 //
 // SSIM is computed from four windowed quantities: mean(x), e = mean(x) - mean(y), P = E[x^2 + y^2] and
 // Q = E[(x - y)^2]. With A = mean(x)^2 + mean(y)^2 + C1, V = Q - e^2 (the variance of x - y) and
-// S = P - mean(x)^2 - mean(y)^2 + C2, it is SSIM = (1 - e^2 / A) (1 - V / S). This is the textbook quotient
-// rearranged. It needs four quantities instead of five, and it stays accurate in flat regions, where
-// var(x) + var(y) cancels. In float32 this holds for values up to some 10, because S is a small difference of
-// squares; images have values from 0 to 1. The windows are separable, so a quantity takes O(22 B H W)
-// multiply-adds.
+// S = P - mean(x)^2 - mean(y)^2 + C2, it is SSIM = (1 - e^2 / A) (1 - V / S). Unlike the textbook quotient,
+// this needs four quantities instead of five, and it stays accurate in flat regions, where var(x) + var(y)
+// cancels (in float32 for values up to some 10).
 //
 // The sums are written in parts, double [B, K, 2]. Each part is the sum over a fixed block of pixels in a
 // fixed order, and zero if the block has no pixel; the op report (below) adds the parts up. The
@@ -143,28 +139,23 @@ void photometric(const PhotometricArgs<T>& args, Workspace&, CudaStream);
 
 // The report of a training step: the sums of the loss, added up from the parts that the photometric kernel
 // wrote, and the costs of this rank's tiles. One launch writes the report to the memory of every rank that
-// reads it.
-//
-//   parts double [B, K, 2], sums of |x - y| and of SSIM of each view in K parts -> l1 [B], ssim [B]
-//   tile_work int32 [tiles], of which [tile_begin, tile_end) are this rank's  -> tiles [tiles], only those
-//
-// Parts are added in a fixed order. CPU and CUDA agree to the rounding of doubles.
+// reads it. Parts are added in a fixed order. CPU and CUDA agree to the rounding of doubles.
 
 constexpr int kMaxReportTargets = 16;
 
 // The memory of one rank that gets the report, a peer's or this rank's own.
 template <class T>
 struct ReportTarget {
-  T* l1;
-  T* ssim;
-  T* tiles;
+  T* l1;     // [B]
+  T* ssim;   // [B]
+  T* tiles;  // [tiles], of which this rank's are written
 };
 
 template <class T>
 struct Report {
-  const double* parts;
+  const double* parts;  // [B, K, 2]
   std::int64_t views, n_parts;
-  const std::int32_t* tile_work;
+  const std::int32_t* tile_work;  // [tiles]
   std::int64_t tile_begin, tile_end;
   ReportTarget<T> targets[kMaxReportTargets];
   int n_targets;
@@ -184,9 +175,9 @@ struct LossOfSums {
 
 namespace BLITZGS_BACKEND {
 template <class T>
-void loss_of_sums(const LossOfSums<T>&, Workspace&, CudaStream);
+void loss_of_sums(const LossOfSums<T>&, CudaStream);
 template <class T>
-void report(const Report<T>& report, Workspace&, CudaStream);
+void report(const Report<T>& report, CudaStream);
 }  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -49,7 +49,7 @@ __global__ void __launch_bounds__(kLossThreads) loss_of_sums_kernel(const LossOf
 }  // namespace
 
 template <>
-void report<float>(const Report<float>& report, Workspace&, CudaStream stream) {
+void report<float>(const Report<float>& report, CudaStream stream) {
   const auto blocks =
       static_cast<unsigned>(report.views) + blocks_for(report.tile_end - report.tile_begin, kReportThreads);
   if (blocks == 0) return;
@@ -58,7 +58,7 @@ void report<float>(const Report<float>& report, Workspace&, CudaStream stream) {
 }
 
 template <>
-void loss_of_sums<float>(const LossOfSums<float>& args, Workspace&, CudaStream stream) {
+void loss_of_sums<float>(const LossOfSums<float>& args, CudaStream stream) {
   loss_of_sums_kernel<<<1, kLossThreads, 0, stream>>>(args);
   check_launch("loss_of_sums");
 }

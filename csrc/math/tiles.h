@@ -60,11 +60,6 @@ BLITZGS_HD T clamp_nan_high(T value, T low, T high) {
   return value < high ? (value > low ? value : low) : high;
 }
 
-template <class T>
-BLITZGS_HD bool finite(T value) {
-  return value - value == T(0);
-}
-
 // x / size for x >= 0. If the size is a power of two, as tile sizes usually are, the division is a shift.
 struct Divider {
   int size, shift;
@@ -124,8 +119,8 @@ struct SplatEllipse {
 template <class T>
 BLITZGS_HD bool make_ellipse(const T* conic, T opacity, SplatEllipse<T>* ellipse) {
   const T a = conic[0], b = conic[1], c = conic[2];
-  if (!(opacity >= static_cast<T>(kAlphaCut)) || !tiles::finite(opacity)) return false;
-  if (!(a > T(0)) || !(c > T(0)) || !tiles::finite(a) || !tiles::finite(b) || !tiles::finite(c)) return false;
+  if (!(opacity >= static_cast<T>(kAlphaCut)) || !is_finite(opacity)) return false;
+  if (!(a > T(0)) || !(c > T(0)) || !is_finite(a) || !is_finite(b) || !is_finite(c)) return false;
   const T exact = T(2) * std::log(T(255) * opacity);
   ellipse->cut = mul_add(exact > T(0) ? exact : T(0), T(1.00002), T(2e-5));
   const ConicFactor<T> factor = factor_conic(conic);
@@ -140,7 +135,7 @@ BLITZGS_HD bool make_ellipse(const T* conic, T opacity, SplatEllipse<T>* ellipse
   ellipse->half_height = std::sqrt(mul(ellipse->cut, static_cast<T>(static_cast<double>(a) * inverse)));
   ellipse->half_width = std::sqrt(mul(ellipse->cut, static_cast<T>(static_cast<double>(c) * inverse)));
   ellipse->turn = b == T(0) ? T(0) : -(b / c) * ellipse->half_width;
-  return tiles::finite(ellipse->shear) && tiles::finite(ellipse->inv_l11);
+  return is_finite(ellipse->shear) && is_finite(ellipse->inv_l11);
 }
 
 // Sets the first and last index of the pixel centres i + 0.5 in [low, high], within [0, size); first > last
@@ -200,7 +195,7 @@ BLITZGS_HD TileRows<T> find_tile_rows(const T* mean2d, const T* conic, T opacity
   rows.last = -1;
   rows.x = mean2d[0];
   rows.y = mean2d[1];
-  if (!tiles::finite(rows.x) || !tiles::finite(rows.y)) return rows;
+  if (!is_finite(rows.x) || !is_finite(rows.y)) return rows;
   if (!make_ellipse(conic, opacity, &rows.ellipse)) return rows;
   const T half = mul_add(kRounding, std::fabs(rows.y), rows.ellipse.half_height);
   pixels_between(rows.y - half, rows.y + half, height, &rows.row_first, &rows.row_last);

@@ -2,6 +2,9 @@
 // Three-vectors and the few scalar helpers the maths headers share.
 #pragma once
 #include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <type_traits>
 
 #include "common/kernel.h"
 
@@ -30,6 +33,16 @@ BLITZGS_HD T mul(T a, T b) {
 #else
   return a * b;
 #endif
+}
+
+// Maps floats to unsigned integers of the same order; -0 comes before 0.
+template <class T>
+BLITZGS_HD auto ordered_bits(T value) {
+  using Bits = std::conditional_t<sizeof(T) == 4, std::uint32_t, std::uint64_t>;
+  constexpr int kSign = 8 * sizeof(T) - 1;
+  Bits bits;
+  std::memcpy(&bits, &value, sizeof(bits));
+  return bits ^ (bits >> kSign ? ~Bits{0} : Bits{1} << kSign);
 }
 
 template <class T>

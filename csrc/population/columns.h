@@ -4,10 +4,10 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
-#include <cstring>
 
 #include "common/kernel.h"
 #include "math/counter_random.h"
+#include "math/vec.h"
 
 // Copies rows between columns of a table: row to[i] of `out` becomes row from[i] of `column`.
 //
@@ -110,17 +110,9 @@ struct KeyHistogram {
   std::int64_t* counts;  // set to zero first
 };
 
-// Maps a float to 32 bits with the same order; -0 equals 0.
-BLITZGS_HD std::uint32_t ordered_bits(float key) {
-  key += 0.0f;
-  std::uint32_t bits;
-  std::memcpy(&bits, &key, sizeof(bits));
-  return bits ^ (bits >> 31 ? 0xffffffffu : 0x80000000u);
-}
-
-// The digit of a key; -1 if its bits before it are not the prefix.
+// The digit of a key; -1 if its bits before it are not the prefix. -0 equals 0.
 BLITZGS_HD int digit_of(const KeyHistogram& args, std::int64_t prefix, float key) {
-  const std::uint64_t head = std::uint64_t{ordered_bits(key)} >> args.shift;
+  const std::uint64_t head = std::uint64_t{ordered_bits(key + 0.0f)} >> args.shift;
   if (static_cast<std::int64_t>(head >> args.width) != prefix) return -1;
   return static_cast<int>(head & ((std::uint64_t{1} << args.width) - 1));
 }
@@ -150,7 +142,7 @@ struct KeysUpTo {
   bool* marks;
 
   BLITZGS_HD void operator()(std::int64_t i) const {
-    marks[i] = std::int64_t{ordered_bits(keys[i])} <= *limit;
+    marks[i] = std::int64_t{ordered_bits(keys[i] + 0.0f)} <= *limit;
   }
 };
 

@@ -73,13 +73,9 @@ struct DensityStats {
 };
 
 // The features of candidates of densification, from which the spawn gate predicts whether their children
-// survive (BlitzGS, section 3.2). The columns are those of blitzgs.spawn.candidates.FEATURES.
-//
-//   columns of a table with N rows (SpawnFeatures), rows int64 [M], is_split bool [M]
-//   ->  features float32 [M, kSpawnFeatures]
-//
-// A feature is computed in float64 and rounded once, so that CPU and CUDA agree but for rare differences in
-// the last bit. One thread per candidate. The cost is O(M).
+// survive (BlitzGS, section 3.2). The features are those of blitzgs.spawn.candidates.FEATURES. Each is
+// computed in float64 and rounded once, so that CPU and CUDA agree but for rare differences in the last bit.
+// The cost is O(M).
 
 constexpr int kSpawnFeatures = 10;
 
@@ -97,7 +93,7 @@ struct SpawnFeatures {
   std::int64_t n, time;            // time: of the event, in images
   double extent;                   // of the scene
   int level_count;
-  float* features;
+  float* features;  // [M, kSpawnFeatures]
 
   BLITZGS_HD void operator()(std::int64_t candidate) const {
     const std::int64_t row = rows[candidate];

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "population/density.h"
 
+#include <bit>
+
 #include "common/op.h"
 #include "common/rows.h"
 #include "population/columns.h"
@@ -184,6 +186,7 @@ void share_rows_(const Tensor& opacities_in, const Tensor& scales, const std::ve
     float* const values = mutable_data<float>(moments[c]);
     const std::size_t parameter = c % kParameters, order = c / kParameters;
     if (parameter == kOpacity) {
+      check_shape(kOp, "a moment of the opacity", moments[c], {count});
       of_opacity[order] = values;
     } else {
       auto& columns = order == 0 ? scaled.avgs : scaled.avg_sqs;
@@ -257,13 +260,10 @@ void find_digit_(const Tensor& search_in, const Tensor& counts_in) {
   constexpr const char* kOp = "find_digit_";
   const auto search = checked_in_place<std::int64_t>(kOp, "search", search_in, {3});
   const auto counts = checked<std::int64_t>(kOp, "counts", counts_in, {-1});
-  const std::int64_t n = counts.size(0);
-  int width = 0;
-  while ((std::int64_t{1} << width) < n) ++width;
-  BLITZGS_CHECK(n > 0 && (std::int64_t{1} << width) == n, kOp, "there must be a power of two counts, got ",
-                n);
+  const auto n = static_cast<std::uint64_t>(counts.size(0));
+  BLITZGS_CHECK(std::has_single_bit(n), kOp, "there must be a power of two counts, got ", n);
   DeviceScope scope(search);
-  backend::find_digit({counts, width, search}, scope.stream);
+  backend::find_digit({counts, std::countr_zero(n), search}, scope.stream);
 }
 
 Tensor keys_up_to(const Tensor& keys_in, const Tensor& limit_in) {

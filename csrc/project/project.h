@@ -22,11 +22,7 @@
 // 2. write_splats (write_splats_cuda.cu) projects the listed pairs of a candidate and a view, counts the
 //    pairs that are splats, and writes the splats in order, in one launch;
 // 3. write_colors (project_cuda.cu) computes the colour of each splat.
-// When the caller gives a capacity, CUDA queues all three without waiting for the number of splats. Without a
-// capacity project() waits for the number, allocates, and launches write_splats a second time.
-//
-// On several ranks, rank_tiles holds the range of tiles that each rank composites. The loop that counts the
-// tiles of a splat then also finds the ranks that need the splat.
+// Without a capacity, project() launches write_splats a second time, when it knows the number of splats.
 //
 // project_bwd (project_bwd_device.cuh on CUDA) visits each visible Gaussian once, recomputes its splats and
 // sums their gradients in splat order, so it needs no atomics and is deterministic. It sums the pose
@@ -69,9 +65,8 @@ BLITZGS_HD float inverse_reach2_of(const LevelFade& fade, std::int64_t id) {
   return fade.inverse_reach2[level < last ? level : last];
 }
 
-// The three sources from which the projection's backward pass reads the gradients of the splats. Each has the
-// same three members: geometry(r) and color(r), the gradients of splat r, and colored(), whether the source
-// has gradients of colours.
+// The three sources from which the projection's backward pass reads the gradients of the splats: geometry(r)
+// and color(r) are those of splat r, and colored() says whether there are gradients of colours.
 
 // One array for each attribute: [P, 2], [P, 3], [P], [P], [P, 3]. depths and colors may be null (zero).
 template <class T>
@@ -166,6 +161,13 @@ struct ProjectInputs {
   const std::int32_t* n_active = nullptr;
   LevelFade fade{};
   const std::int32_t* n_blocks = nullptr;
+
+  BLITZGS_HD Camera<T> camera(int view) const {
+    return make_camera(viewmats + 16 * view, Ks + 9 * view, options.width, options.height);
+  }
+  BLITZGS_HD std::int64_t candidate_id(std::int64_t candidate) const {
+    return active_ids ? active_ids[candidate] : candidate;
+  }
 };
 
 // The totals of project(), int64 [project_totals(...)], in the memory of the inputs: U visible Gaussians, P
@@ -286,8 +288,7 @@ void project(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::in
 // writes colors, opacities, radii and tiles_touched; other columns may be null. It does nothing if there are
 // more splats than the capacity. On the CPU the sizes of the capacity are the actual numbers.
 template <class T>
-void color_splats(const ProjectInputs<T>&, const ProjectCapacity&, const ProjectColumns<T>&, Workspace&,
-                  CudaStream);
+void color_splats(const ProjectInputs<T>&, const ProjectCapacity&, const ProjectColumns<T>&, CudaStream);
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientSource<T>&,
                  const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream);

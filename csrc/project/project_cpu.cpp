@@ -14,16 +14,8 @@ namespace {
 template <class T>
 std::vector<Camera<T>> make_cameras(const ProjectInputs<T>& in) {
   std::vector<Camera<T>> cameras;
-  for (int view = 0; view < in.n_views; ++view) {
-    cameras.push_back(
-        make_camera(in.viewmats + 16 * view, in.Ks + 9 * view, in.options.width, in.options.height));
-  }
+  for (int view = 0; view < in.n_views; ++view) cameras.push_back(in.camera(view));
   return cameras;
-}
-
-template <class T>
-std::int64_t candidate_id(const ProjectInputs<T>& in, std::int64_t candidate) {
-  return in.active_ids ? in.active_ids[candidate] : candidate;
 }
 
 template <class T>
@@ -33,33 +25,29 @@ ActivatedGaussian<T> load_gaussian(const ProjectInputs<T>& in, std::int64_t id) 
       activate_opacity(in.opacities[id], in.options.raw), static_cast<T>(inverse_reach2_of(in.fade, id)));
 }
 
-// A splat that the counting pass of project() found, kept for the writing pass: the splat, the number of its
-// tiles, and the ranks that need it as bits.
+// A splat that the counting pass of project() found, kept for the writing pass: the splat, its Gaussian and
+// view, the number of its tiles, and the ranks that need it as bits.
 template <class T>
 struct KeptSplat {
   Splat<T> splat;
-  std::int32_t tiles;
+  std::int32_t id, view, tiles;
   std::int64_t ranks;
 };
 
-// The result of the counting pass for a block of kProjectBlock candidates: its splats, the views that see
-// each candidate (as bits), the number of its visible Gaussians, and the numbers of visible Gaussians and
-// splats in all blocks before it.
+// The result of the counting pass for a block of kProjectBlock candidates: its splats, the number of its
+// visible Gaussians, and the numbers of visible Gaussians and splats in all blocks before it.
 template <class T>
 struct CountedBlock {
   std::vector<KeptSplat<T>> splats;
-  std::vector<std::uint32_t> views;
   std::int64_t visible = 0, visible_before = 0, splats_before = 0;
 };
 
-// Projects a candidate into the views that may see it, appends its splats to `splats`, adds to `totals`, and
-// returns the views of its splats as bits.
+// Projects a candidate into the views that may see it, appends its splats to `splats` and adds to `totals`.
 template <class T>
-std::uint32_t project_candidate(const ProjectInputs<T>& in, const RankTiles& rank_tiles,
-                                const std::vector<Camera<T>>& cameras, const std::vector<Frustum>& frusta,
-                                std::int64_t candidate, std::vector<KeptSplat<T>>* splats,
-                                std::int64_t* totals) {
-  const std::int64_t id = candidate_id(in, candidate);
+void project_candidate(const ProjectInputs<T>& in, const RankTiles& rank_tiles,
+                       const std::vector<Camera<T>>& cameras, const std::vector<Frustum>& frusta,
+                       std::int64_t candidate, std::vector<KeptSplat<T>>* splats, std::int64_t* totals) {
+  const std::int64_t id = in.candidate_id(candidate);
   const std::uint32_t allowed =
       in.active_views ? static_cast<std::uint32_t>(in.active_views[candidate]) : ~std::uint32_t{0};
   const Vec3<T> mean = load3(in.means + 3 * id);
@@ -70,15 +58,15 @@ std::uint32_t project_candidate(const ProjectInputs<T>& in, const RankTiles& ran
     maybe |= static_cast<std::uint32_t>(may_be_in_depth(frusta[view], point, norm)) << view;
   }
   maybe &= allowed;
-  if (maybe == 0) return 0;
+  if (maybe == 0) return;
   const Vec3<T> scale = activate_scale(in.scales + 3 * id, in.options.raw);
   const T opacity = activate_opacity(in.opacities[id], in.options.raw);
-  if (visible_sigmas(opacity) < T(0)) return 0;
+  if (visible_sigmas(opacity) < T(0)) return;
   // A stored scale may be negative; the Gaussian is that of its absolute value.
   const T widest = larger(larger(std::fabs(scale.x), std::fabs(scale.y)), std::fabs(scale.z));
   const float sigma = opacity <= T(1) ? 1.00001f * static_cast<float>(widest) : kAnyWidth;
   ActivatedGaussian<T> gaussian{};
-  std::uint32_t seen = 0;
+  const std::size_t before = splats->size();
   std::int64_t* by_rank = totals + kTotalViews + in.n_views;
   for (std::uint32_t rest = maybe, first = 1; rest != 0; rest &= rest - 1) {
     const int view = __builtin_ctz(rest);
@@ -88,7 +76,7 @@ std::uint32_t project_candidate(const ProjectInputs<T>& in, const RankTiles& ran
                                    static_cast<T>(inverse_reach2_of(in.fade, id)));
       first = 0;
     }
-    KeptSplat<T> kept{};
+    KeptSplat<T> kept{{}, static_cast<std::int32_t>(id), view, 0, 0};
     if (!project_splat(cameras[view], gaussian, in.options, &kept.splat)) continue;
     kept.tiles = splat_tiles(kept.splat, view, in.options, rank_tiles, &kept.ranks,
                              [&](int rank, std::int64_t tiles) { by_rank[2 * rank + 1] += tiles; });
@@ -97,16 +85,15 @@ std::uint32_t project_candidate(const ProjectInputs<T>& in, const RankTiles& ran
     ++totals[kTotalViews + view];
     totals[kTotalTiles] += kept.tiles;
     splats->push_back(kept);
-    seen |= std::uint32_t{1} << view;
   }
-  totals[kTotalVisible] += seen != 0;
-  return seen;
+  totals[kTotalVisible] += splats->size() > before;
 }
 
 template <class T>
-void write_splat(const ProjectInputs<T>& in, const Camera<T>& camera, std::int64_t id, std::int64_t index,
+void write_splat(const ProjectInputs<T>& in, const Camera<T>& camera, std::int64_t index,
                  const KeptSplat<T>& kept, const ProjectOutputs<T>& out) {
   const Splat<T>& splat = kept.splat;
+  const std::int64_t id = kept.id;
   std::copy_n(splat.mean2d, 2, out.means2d + 2 * index);
   std::copy_n(splat.conic, 3, out.conics + 3 * index);
   out.depths[index] = splat.depth;
@@ -174,14 +161,6 @@ void reduce_poses(const double* sums, std::int64_t n_blocks, int n_views, T* v_v
   }
 }
 
-// Calls f(block, its first candidate, one past its last) for all blocks, in parallel.
-template <class T, class F>
-void for_each_block(std::vector<CountedBlock<T>>& blocks, std::int64_t n_candidates, const F& f) {
-  parallel_rows(static_cast<std::int64_t>(blocks.size()), 1, [&](std::int64_t block) {
-    f(blocks[block], block * kProjectBlock, std::min(n_candidates, (block + 1) * kProjectBlock));
-  });
-}
-
 }  // namespace
 
 template <class T>
@@ -195,11 +174,11 @@ void project(const ProjectInputs<T>& in, const RankTiles& rank_tiles, SplatMemor
   std::fill_n(totals, n_totals, 0);
   if (in.n_blocks) totals[kTotalBlocks] = *in.n_blocks;
   std::mutex adding;
-  for_each_block(blocks, in.n_candidates, [&](CountedBlock<T>& block, std::int64_t first, std::int64_t last) {
+  parallel_rows(std::ssize(blocks), 1, [&](std::int64_t b) {
+    CountedBlock<T>& block = blocks[b];
     std::vector<std::int64_t> sums(n_totals, 0);
-    for (std::int64_t c = first; c < last; ++c) {
-      block.views.push_back(
-          project_candidate(in, rank_tiles, cameras, frusta, c, &block.splats, sums.data()));
+    for (std::int64_t c = b * kProjectBlock; c < std::min(in.n_candidates, (b + 1) * kProjectBlock); ++c) {
+      project_candidate(in, rank_tiles, cameras, frusta, c, &block.splats, sums.data());
     }
     block.visible = sums[kTotalVisible];
     const std::lock_guard<std::mutex> lock(adding);
@@ -213,27 +192,24 @@ void project(const ProjectInputs<T>& in, const RankTiles& rank_tiles, SplatMemor
   const ProjectColumns<T> columns = memory.allocate({visible, splats});
   const ProjectIds& ids = columns.ids;
   ids.splat_offsets[visible] = static_cast<std::int32_t>(splats);
-  for_each_block(blocks, in.n_candidates, [&](CountedBlock<T>& block, std::int64_t first, std::int64_t) {
-    std::int64_t u = block.visible_before, index = block.splats_before;
-    const KeptSplat<T>* kept = block.splats.data();
-    for (std::size_t i = 0; i < block.views.size(); ++i) {
-      if (block.views[i] == 0) continue;
-      const auto id = static_cast<std::int32_t>(candidate_id(in, first + static_cast<std::int64_t>(i)));
-      ids.visible_ids[u] = id;
-      ids.splat_offsets[u++] = static_cast<std::int32_t>(index);
-      for (std::uint32_t rest = block.views[i]; rest != 0; rest &= rest - 1) {
-        const int view = __builtin_ctz(rest);
-        ids.gaussian_ids[index] = id;
-        ids.camera_ids[index] = view;
-        write_splat(in, cameras[view], id, index++, *kept++, columns.values);
+  parallel_rows(std::ssize(blocks), 1, [&](std::int64_t b) {
+    std::int64_t u = blocks[b].visible_before, index = blocks[b].splats_before;
+    std::int32_t previous = -1;
+    for (const KeptSplat<T>& kept : blocks[b].splats) {
+      if (kept.id != previous) {
+        ids.visible_ids[u] = previous = kept.id;
+        ids.splat_offsets[u++] = static_cast<std::int32_t>(index);
       }
+      ids.gaussian_ids[index] = kept.id;
+      ids.camera_ids[index] = kept.view;
+      write_splat(in, cameras[kept.view], index++, kept, columns.values);
     }
   });
 }
 
 template <class T>
 void color_splats(const ProjectInputs<T>& in, const ProjectCapacity& capacity,
-                  const ProjectColumns<T>& columns, Workspace&, CudaStream) {
+                  const ProjectColumns<T>& columns, CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
   const ProjectOutputs<T>& out = columns.values;
   parallel_rows(capacity.sizes.splats, 1 << 10, [&](std::int64_t i) {
@@ -278,7 +254,7 @@ void zero_arrays(const ZeroedArrays<T>& arrays, CudaStream) {
   template void project<T>(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t*,       \
                            Workspace&, CudaStream);                                                         \
   template void color_splats<T>(const ProjectInputs<T>&, const ProjectCapacity&, const ProjectColumns<T>&,  \
-                                Workspace&, CudaStream);                                                    \
+                                CudaStream);                                                                \
   template void project_bwd<T>(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&,  \
                                const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream); \
   template void zero_arrays<T>(const ZeroedArrays<T>&, CudaStream);

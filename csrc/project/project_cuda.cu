@@ -44,7 +44,7 @@ __device__ void quick_views(const Inputs& in, std::int64_t n_candidates, const F
   for (int k = 0; k < kPrefilterBatch; ++k) {
     const std::int64_t c = first + 32 * k;
     const bool present = c < n_candidates;
-    ids[k] = present ? static_cast<std::int32_t>(candidate_id(in, c)) : 0;
+    ids[k] = present ? static_cast<std::int32_t>(in.candidate_id(c)) : 0;
     maybe[k] = !present ? 0u : in.active_views ? static_cast<std::uint32_t>(in.active_views[c]) : ~0u;
     if (in.n_views < 32) maybe[k] &= (1u << in.n_views) - 1u;
     means[k] = maybe[k] ? load3(in.means + std::int64_t{3} * ids[k]) : Vec3<float>{0.f, 0.f, 0.f};
@@ -236,7 +236,7 @@ void project<float>(const Inputs& in, const RankTiles& rank_tiles, SplatMemory<f
 
 template <>
 void color_splats<float>(const Inputs& in, const ProjectCapacity& capacity,
-                         const ProjectColumns<float>& columns, Workspace&, CudaStream stream) {
+                         const ProjectColumns<float>& columns, CudaStream stream) {
   write_colors(in, capacity, columns, stream);
 }
 

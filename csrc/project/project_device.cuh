@@ -14,10 +14,7 @@ using Inputs = ProjectInputs<float>;
 
 // Fills `cameras` (shared memory) with the cameras of the launch. The caller synchronises the block.
 __device__ inline void load_cameras(const Inputs& in, Camera<float>* cameras) {
-  for (int view = threadIdx.x; view < in.n_views; view += blockDim.x) {
-    cameras[view] =
-        make_camera(in.viewmats + 16 * view, in.Ks + 9 * view, in.options.width, in.options.height);
-  }
+  for (int view = threadIdx.x; view < in.n_views; view += blockDim.x) cameras[view] = in.camera(view);
 }
 
 __host__ __device__ inline bool aligned16(const void* pointer) {
@@ -266,10 +263,6 @@ inline std::uint64_t* turn_zeros(std::int64_t turns, Workspace& workspace, CudaS
 // The number of valid candidates.
 __device__ inline std::int64_t candidates_of(const Inputs& in) {
   return in.n_active ? *in.n_active : in.n_candidates;
-}
-
-__device__ inline std::int64_t candidate_id(const Inputs& in, std::int64_t candidate) {
-  return in.active_ids ? in.active_ids[candidate] : candidate;
 }
 
 // The numbers of visible Gaussians and splats that write_splats wrote, or zeros if they exceeded the

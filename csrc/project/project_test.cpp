@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "project/project.h"
 
-#include <algorithm>
 #include <numeric>
 #include <random>
 #include <vector>
@@ -114,21 +113,6 @@ TEST_CASE("the backward pass is the derivative of the splats") {
   REQUIRE(slope(&world.means[3 * id]) == Approx(v_means[3 * (U / 3)]).epsilon(1e-5).margin(1e-3));
   REQUIRE(slope(&world.scales[3 * id]) == Approx(v_scales[3 * (U / 3)]).epsilon(1e-5).margin(1e-3));
   REQUIRE(slope(&world.viewmats[3]) == Approx(v_viewmats[3]).epsilon(1e-4));
-}
-
-TEST_CASE("each splat knows the ranks that composite its tiles, and the totals count them") {
-  const World world;
-  // Four ranks share the 18 tiles of three views of 3 x 2; the second has none.
-  const Projected p = project(world.inputs(), {{0, 7, 7, 12}, {7, 7, 12, 18}, 4});
-  const std::int64_t* of_rank = p.totals.data() + kTotalViews + World::kViews;  // splats and their tiles
-  std::int64_t tiles = 0;
-  for (int m = 0; m < 4; ++m) {
-    REQUIRE(of_rank[2 * m] == std::count_if(p.rank_masks.begin(), p.rank_masks.end(),
-                                            [&](std::int64_t mask) { return mask >> m & 1; }));
-    REQUIRE((of_rank[2 * m] == 0) == (m == 1));
-    tiles += of_rank[2 * m + 1];
-  }
-  REQUIRE(tiles == p.totals[kTotalTiles]);
 }
 
 TEST_CASE("arrays are zeroed to their ends") {

@@ -168,12 +168,9 @@ struct UnscentedInputs {
   const T *lenses, *viewmats_rs;
   UnscentedOptions options;
 
-  BLITZGS_HD Camera<T> pinhole(int view) const {
-    return make_camera(in.viewmats + 16 * view, in.Ks + 9 * view, in.options.width, in.options.height);
-  }
   BLITZGS_HD LensCamera camera(int view) const {
-    return make_lens_camera(pinhole(view), in.options.width, in.options.height, lenses + kLensNumbers * view,
-                            options.shutter, in.viewmats + 16 * view,
+    return make_lens_camera(in.camera(view), in.options.width, in.options.height,
+                            lenses + kLensNumbers * view, options.shutter, in.viewmats + 16 * view,
                             viewmats_rs ? viewmats_rs + 16 * view : nullptr);
   }
   BLITZGS_HD ActivatedGaussian<double> gaussian(std::int64_t id) const {
@@ -215,8 +212,8 @@ struct UnscentedSplats {
     bool shown =
         unscented_splat(inputs.camera(view), inputs.gaussian(id), in.options, inputs.options, &splat);
     if (in.sh) {
-      shown = splat_color(inputs.pinhole(view), load3(in.means + 3 * id),
-                          in.sh + 3 * in.options.sh_stride * id, in.options.sh_degree, out.colors + 3 * i) &&
+      shown = splat_color(in.camera(view), load3(in.means + 3 * id), in.sh + 3 * in.options.sh_stride * id,
+                          in.options.sh_degree, out.colors + 3 * i) &&
               shown;
     }
     std::int64_t ranks;
@@ -257,8 +254,8 @@ struct UnscentedGradients {
         unscented_splat_vjp(inputs.camera(view), gaussian, in.options, inputs.options, v.geometry(r),
                             &gradient);
         if (!in.sh) continue;
-        splat_color_vjp(inputs.pinhole(view), load3(in.means + 3 * i), in.sh + stride * i,
-                        in.options.sh_degree, v.colors + 3 * r, out.sh + stride * i, &v_mean,
+        splat_color_vjp(in.camera(view), load3(in.means + 3 * i), in.sh + stride * i, in.options.sh_degree,
+                        v.colors + 3 * r, out.sh + stride * i, &v_mean,
                         static_cast<PoseGradient<T>*>(nullptr));
       }
       gradient.mean = gradient.mean + Vec3<double>{v_mean.x, v_mean.y, v_mean.z};

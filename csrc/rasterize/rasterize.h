@@ -1,17 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// Rasterisation (docs/image.md, sections 3 and 5): alpha compositing of each tile's list, front to back
-// (Kerbl et al. 2023, Eq. 3), and its gradient. The kernels are forward_kernel (rasterize_fwd_cuda.cu) and
-// backward_kernel (rasterize_bwd_cuda.cu) on CUDA, forward_tile (tile_forward.h) and backward_tile
-// (tile_kernels.h) on the CPU.
-//
-// Per pixel with centre (i + 0.5, j + 0.5), over the tile's list in order, T = 1 at the start:
-//   q     = a dx^2 + 2 b dx dy + c dy^2,  (dx, dy) = pixel centre - mean2d,  conic = (a, b, c)
-//   alpha = min(0.99, opacity * exp(-q / 2));           skipped unless alpha >= 1/255
-//   if T (1 - alpha) < 1e-4 the pixel ends and this splat is not composited
-//   color += alpha T splat_color;  T *= 1 - alpha
-// and at the end color += T background. There is no other cut: culling inside the kernel is conservative.
-// (The kernels evaluate q through factor_conic() of math/tiles.h, because the slack of the tile test covers
-// the rounding of that form.)
+// Rasterisation: alpha compositing of each tile's list, front to back, as docs/image.md defines it (sections
+// 3 and 5; Kerbl et al. 2023, Eq. 3), and its gradient. Culling inside the kernels is conservative. They
+// evaluate
+//   q = a dx^2 + 2 b dx dy + c dy^2,  (dx, dy) = pixel centre - mean2d,  conic = (a, b, c)
+// through factor_conic() of math/tiles.h, because the slack of the tile test covers the rounding of that
+// form.
 //
 //   means2d [P, 2], conics [P, 3], opacities [P], colors [P, D], backgrounds [B, D] or null, isect_splats and
 //   tile_offsets from intersect  ->  renders [B, H, W, D]; transmittances [B, H, W] (final T; alpha = 1 - T);
@@ -21,8 +14,8 @@
 //   outputs, transmittance included; without it they are not written.
 //
 // Exactness: a pixel depends only on its tile's list and the splats in it. The range of tiles, the position
-// in the batch, the number of threads and (CPU) the instruction set therefore change no bit. The CPU float32
-// kernel does the same operations with and without AVX2. CPU and CUDA agree to rounding.
+// in the batch, the number of threads and (CPU) the instruction set therefore change no bit. CPU and CUDA
+// agree to rounding.
 //
 // Gradients, given v_renders [B, H, W, D] and optionally v_alphas [B, H, W]: per splat v_means2d [P, 2],
 // v_conics [P, 3] (of a, b, c as three independent numbers), v_opacities [P], v_colors [P, D], and with
@@ -39,10 +32,8 @@
 // caller computes the gradient of the background, the sum over pixels of v_renders * T. Splats in no list get
 // zeros. v_renders of unowned tiles are not read.
 //
-// On CUDA, the forward pass may be queued with a capacity n_splats before the number of splats is known. The
-// kernels then read the number from known_splats (common/kernel.h). They pack so many splats and set the
-// gradients of so many to zero; gradients beyond are unspecified. The backward pass may then be called with
-// just these splats.
+// With known_splats (common/kernel.h), gradients beyond that number are unspecified, and the backward pass
+// may be called with just these splats.
 //
 // The CPU gradient is bitwise repeatable for any number of threads: there is one partial sum per splat and
 // tile, and these are added in the order of the tiles. The CUDA gradient is repeatable if `deterministic` is

@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
-#include <cstring>
 #include <vector>
 
 #include "common/parallel.h"
@@ -178,13 +177,8 @@ BLITZGS_INSTANTIATE(double)
 
 template <class T>
 void pixel_splats(const RasterizeInput<T>& in, const PixelSplats<T>& out, Workspace& workspace, CudaStream) {
-  const PreparedSplat<T>* splats = pack_splats(in, allocate_splats<T>(in.n_splats, workspace));
-  const TileKernels<T> kernels = tile_kernels<T>(0, false);
-  const TileMemory<T> memory(in, workspace);
-  parallel_tasks(in.grid.count(), [&](std::int64_t tile, int worker) {
-    TileJob<T> job = make_job(in, splats, tile);
-    memory.lend(worker, &job);
-    kernels.list_splats(job, out);
+  for_each_colorless_tile(in, workspace, [&](const TileKernels<T>& kernels, const TileJob<T>& tile) {
+    kernels.list_splats(tile, out);
   });
 }
 

@@ -13,40 +13,10 @@ constexpr bool kPacked = true;
 constexpr bool kPacked = false;
 #endif
 
-// The arguments that forward and backward share, checked and contiguous.
-struct Splats : ListedSplats {
-  Splats(const char* op, const Tensor& means2d_in, const Tensor& conics_in, const Tensor& opacities_in,
-         const Tensor& colors_in, const std::optional<Tensor>& backgrounds_in, const Tensor& isect_splats_in,
-         const Tensor& tile_offsets_in, const TileGrid& grid_in,
-         const std::optional<Tensor>& known_splats = std::nullopt)
-      : ListedSplats(op, means2d_in, conics_in, opacities_in, isect_splats_in, tile_offsets_in, grid_in,
-                     known_splats) {
-    colors = checked(op, "colors", colors_in, means2d.scalar_type(), {n_splats, -1});
-    n_channels = colors.size(1);
-    BLITZGS_CHECK(n_channels > 0 && n_channels <= 4096, op, "colors must have 1 to 4096 channels, got ",
-                  n_channels);
-    backgrounds =
-        checked(op, "backgrounds", backgrounds_in, colors.scalar_type(), {grid.n_cameras, n_channels});
-  }
-
-  template <class T>
-  RasterizeInput<T> input() const {
-    RasterizeInput<T> in = ListedSplats::input<T>();
-    in.colors = data<T>(colors);
-    in.backgrounds = data_or_null<T>(backgrounds);
-    in.n_channels = static_cast<int>(n_channels);
-    return in;
-  }
-
-  std::int64_t n_channels = 0;
-  Tensor colors;
-  std::optional<Tensor> backgrounds;
-};
-
 using CompositedTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 // Runs the forward pass. It sets splat_gradients to zero if they are given.
-CompositedTensors composite(const Splats& splats, const std::optional<Tensor>& splat_gradients,
+CompositedTensors composite(const ListedSplats& splats, const std::optional<Tensor>& splat_gradients,
                             bool clear_rest) {
   const TileGrid& grid = splats.grid;
   const Tensor& like = splats.means2d;
@@ -84,8 +54,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd
     const std::optional<Tensor>& known_splats) {
   constexpr const char* kOp = "rasterize_fwd";
   const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
-  const Splats splats(kOp, means2d, conics, splat_opacities, colors, backgrounds, isect_splats, tile_offsets,
-                      grid, known_splats);
+  ListedSplats splats(kOp, means2d, conics, splat_opacities, isect_splats, tile_offsets, grid, known_splats);
+  splats.set_colors(kOp, colors, backgrounds);
   const bool packed = kPacked && backward_follows && splats.n_channels <= 4;
   Tensor splat_gradients = make_empty(splats.means2d, {packed ? splats.n_splats : 0, kSplatGradient});
   auto composited = composite(splats, packed ? std::optional(splat_gradients) : std::nullopt, clear_rest);
@@ -95,7 +65,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd
 namespace {
 
 // Checks a table of splat gradients that a caller gives (CUDA).
-void check_gradients(const char* op, const Splats& splats, const Tensor& gradients) {
+void check_gradients(const char* op, const ListedSplats& splats, const Tensor& gradients) {
   BLITZGS_CHECK(kPacked, op, "tables of gradients need CUDA");
   BLITZGS_CHECK(splats.n_channels <= 4, op, "colors must have 1 to 4 channels, got ", splats.n_channels);
   check_in_place(op, "gradients", gradients, ScalarType::Float, {-1, kSplatGradient});
@@ -118,8 +88,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
                 "composited must be (transmittances, last_ids, packed_splats, tile_order), got ",
                 composited.size(), " tensors");
   const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
-  const Splats splats(kOp, splats_in[0], splats_in[1], splats_in[2], splats_in[3], backgrounds, lists[0],
-                      lists[1], grid);
+  ListedSplats splats(kOp, splats_in[0], splats_in[1], splats_in[2], lists[0], lists[1], grid);
+  splats.set_colors(kOp, splats_in[3], backgrounds);
   if (gradients) check_gradients(kOp, splats, *gradients);
   BLITZGS_CHECK(!gradients || !v_alphas_in, kOp, "v_alphas needs gradients in columns");
   const auto last_ids = checked<std::int32_t>(kOp, "last_ids", composited[1], {n_cameras, height, width});
@@ -174,8 +144,8 @@ CompositedTensors rasterize_fwd_into(const Tensor& means2d, const Tensor& conics
                                      const std::optional<Tensor>& known_splats) {
   constexpr const char* kOp = "rasterize_fwd_";
   const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
-  const Splats splats(kOp, means2d, conics, splat_opacities, colors, backgrounds, isect_splats, tile_offsets,
-                      grid, known_splats);
+  ListedSplats splats(kOp, means2d, conics, splat_opacities, isect_splats, tile_offsets, grid, known_splats);
+  splats.set_colors(kOp, colors, backgrounds);
   check_gradients(kOp, splats, gradients);
   return composite(splats, gradients, false);
 }

@@ -26,26 +26,36 @@ struct ListedSplats {
     tile_offsets = checked(op, "tile_offsets", tile_offsets_in, ScalarType::Long, {grid.count() + 1});
   }
 
-  // The input of kernels that need no colours.
+  // The colours [P, D] to composite, before backgrounds [B, D] or black.
+  void set_colors(const char* op, const Tensor& colors_in, const std::optional<Tensor>& backgrounds_in) {
+    const ScalarType dtype = means2d.scalar_type();
+    colors = checked(op, "colors", colors_in, dtype, {n_splats, -1});
+    n_channels = colors->size(1);
+    BLITZGS_CHECK(n_channels > 0 && n_channels <= 4096, op, "colors must have 1 to 4096 channels, got ",
+                  n_channels);
+    backgrounds = checked(op, "backgrounds", backgrounds_in, dtype, {grid.n_cameras, n_channels});
+  }
+
   template <class T>
   RasterizeInput<T> input() const {
     return {data<T>(means2d),
             data<T>(conics),
             data<T>(opacities),
-            nullptr,
-            nullptr,
+            data_or_null<T>(colors),
+            data_or_null<T>(backgrounds),
             data<std::int32_t>(isect_splats),
             data<std::int64_t>(tile_offsets),
             splat_count.n_splats,
-            0,
+            static_cast<int>(n_channels),
             grid,
             splat_count.known_splats};
   }
 
   TileGrid grid;
-  std::int64_t n_splats;  // the length of the columns
+  std::int64_t n_splats, n_channels = 0;  // n_splats: the length of the columns
   SplatCount splat_count;
   Tensor means2d, conics, opacities, isect_splats, tile_offsets;
+  std::optional<Tensor> colors, backgrounds;
 };
 
 std::tuple<Tensor, Tensor> intersect(const Tensor& means2d, const Tensor& conics,

@@ -22,15 +22,7 @@ constexpr int kPackedChannels = 5;  // channels that fit the cache line of a Pre
 // The exponent of a splat is -(u^2 + w^2) with u = l11 dx + l21 dy, w = l22 dy. The factors l11, l21 and l22
 // are multiplied by the root of this scale: float32 computes alpha as a power of 2, float64 as a power of e.
 template <class T>
-struct ExponentScale;
-template <>
-struct ExponentScale<float> {
-  static constexpr float value = 0.72134752044448170f;  // log2(e) / 2
-};
-template <>
-struct ExponentScale<double> {
-  static constexpr double value = 0.5;
-};
+constexpr T kExponentScale = sizeof(T) == 4 ? T(0.72134752044448170f) : T(0.5);  // log2(e) / 2, or 1 / 2
 
 // A splat prepared for the kernels, one cache line in float32. It may touch pixels with u^2 + w^2 <= cut, in
 // rows within half_height of y (-1: no row). In the row at dy, these pixels are centred on x - shear dy, with

@@ -22,7 +22,7 @@ TileKernels<T> tile_kernels(int n_channels, bool absgrad) {
 
 template <class T>
 PreparedSplat<T> pack_splat(const RasterizeInput<T>& in, std::int64_t index) {
-  constexpr T kScale = ExponentScale<T>::value;
+  constexpr T kScale = kExponentScale<T>;
   constexpr T kRounding = sizeof(T) == 4 ? T(2e-6) : T(2e-14);
   PreparedSplat<T> splat{};
   SplatEllipse<T> e;
@@ -31,7 +31,7 @@ PreparedSplat<T> pack_splat(const RasterizeInput<T>& in, std::int64_t index) {
   splat.half_height = T(-1);
   splat.cut = T(-1);
   splat.opacity = T(1);
-  if (!tiles::finite(splat.x) || !tiles::finite(splat.y)) return splat;
+  if (!is_finite(splat.x) || !is_finite(splat.y)) return splat;
   if (!make_ellipse(in.conics + 3 * index, in.opacities[index], &e)) return splat;
   const ConicFactor<T> factor = factor_conic(in.conics + 3 * index);
   const T root = std::sqrt(kScale);
@@ -108,6 +108,19 @@ class TileMemory {
   T* memory_;
   std::int32_t* last_;
 };
+
+// Calls f(kernels, job) for each owned tile without colours, on all threads.
+template <class T, class F>
+void for_each_colorless_tile(const RasterizeInput<T>& in, Workspace& workspace, const F& f) {
+  const PreparedSplat<T>* splats = pack_splats(in, allocate_splats<T>(in.n_splats, workspace));
+  const TileKernels<T> kernels = tile_kernels<T>(0, false);
+  const TileMemory<T> memory(in, workspace);
+  parallel_tasks(in.grid.tile_end - in.grid.tile_begin, [&](std::int64_t task, int worker) {
+    TileJob<T> job = make_job(in, splats, in.grid.tile_begin + task);
+    memory.lend(worker, &job);
+    f(kernels, job);
+  });
+}
 
 }  // namespace
 }  // namespace blitzgs::cpu

@@ -118,7 +118,7 @@ inline void differentiate(const TileJob<T>& tile, const PreparedSplat<T>& splat,
 template <class Lanes, bool kAbs, class T>
 void write_partial(const PreparedSplat<T>& splat, const GradientSums<Lanes, kAbs>& sums, const Lanes* v_color,
                    int n_channels, T* partial) {
-  constexpr T kInverse = T(1) / ExponentScale<T>::value;
+  constexpr T kInverse = T(1) / kExponentScale<T>;
   const T gu = sums.gu.sum() * kInverse, gy = sums.gy.sum() * kInverse;
   partial[kMeanX] = splat.l11 * gu;
   partial[kMeanY] = splat.l21 * gu + splat.l22 * splat.l22 * gy;
@@ -162,22 +162,19 @@ void backward_tile(const TileJob<typename Lanes::Scalar>& tile, typename Lanes::
   }
 }
 
+// D: the number of channels; 0: any.
+template <class Lanes, int D>
+TileKernels<typename Lanes::Scalar> kernels_of(bool absgrad) {
+  return {forward_tile<Lanes, D>, absgrad ? backward_tile<Lanes, D, true> : backward_tile<Lanes, D, false>,
+          contribute_tile<Lanes>, list_tile_splats<Lanes>};
+}
+
 template <class Lanes>
 TileKernels<typename Lanes::Scalar> select_kernels(int n_channels, bool absgrad) {
-  switch (n_channels) {
-    case 3:
-      return {forward_tile<Lanes, 3>,
-              absgrad ? backward_tile<Lanes, 3, true> : backward_tile<Lanes, 3, false>,
-              contribute_tile<Lanes>, list_tile_splats<Lanes>};
-    case 4:
-      return {forward_tile<Lanes, 4>,
-              absgrad ? backward_tile<Lanes, 4, true> : backward_tile<Lanes, 4, false>,
-              contribute_tile<Lanes>, list_tile_splats<Lanes>};
-    default:
-      return {forward_tile<Lanes, 0>,
-              absgrad ? backward_tile<Lanes, 0, true> : backward_tile<Lanes, 0, false>,
-              contribute_tile<Lanes>, list_tile_splats<Lanes>};
-  }
+  const auto kernels = n_channels == 3   ? kernels_of<Lanes, 3>
+                       : n_channels == 4 ? kernels_of<Lanes, 4>
+                                         : kernels_of<Lanes, 0>;
+  return kernels(absgrad);
 }
 
 }  // namespace

@@ -109,7 +109,7 @@ struct EmptyEntries {
 };
 
 namespace BLITZGS_BACKEND {
-void gather_rows(const GatherRows&, Workspace&, CudaStream);
+void gather_rows(const GatherRows&, CudaStream);
 void number_rows(const NumberedRows&, const ProjectCapacity&, CudaStream);
 void fill_entries(const EmptyEntries&, CudaStream);
 void arrange_splats(const ArrangeSplats&, bool back, CudaStream);

@@ -6,7 +6,7 @@
 
 namespace blitzgs::cpu {
 
-void gather_rows(const GatherRows& gather, Workspace&, CudaStream) {
+void gather_rows(const GatherRows& gather, CudaStream) {
   parallel_for(0, gather.n, 1 << 10, [&](std::int64_t begin, std::int64_t end) {
     for (int c = 0; c < gather.n_columns; ++c) {
       const GatheredColumn& column = gather.columns[c];

@@ -64,7 +64,7 @@ __global__ void __launch_bounds__(kThreads) arrange_splats_kernel(const ArrangeS
 
 }  // namespace
 
-void gather_rows(const GatherRows& gather, Workspace&, CudaStream stream) {
+void gather_rows(const GatherRows& gather, CudaStream stream) {
   if (gather.n == 0 || gather.n_columns == 0) return;
   const dim3 blocks(blocks_for(gather.n, kThreads), static_cast<unsigned>(gather.n_columns));
   gather_rows_kernel<<<blocks, kThreads, 0, stream>>>(gather);

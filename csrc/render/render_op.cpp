@@ -87,7 +87,7 @@ std::vector<Tensor> gathered_rows(const char* op, const std::vector<Tensor>& col
     for (const Tensor& part : joined) to += add(part, to, stride);
   }
   DeviceScope scope(ids);
-  backend::gather_rows(gather, scope.workspace, scope.stream);
+  backend::gather_rows(gather, scope.stream);
   return found;
 }
 
@@ -155,7 +155,7 @@ TensorList color_rows(const TensorList& gaussians, const TensorList& sh, const T
       columns.values.opacities = mutable_data<T>(splats.opacities);
       columns.values.radii = radii;
       columns.values.tiles_touched = tiles;
-      backend::color_splats(p.inputs<T>(), capacity, columns, scope.workspace, scope.stream);
+      backend::color_splats(p.inputs<T>(), capacity, columns, scope.stream);
     });
   }
   found.insert(found.begin(), {colors, numbers, indices});

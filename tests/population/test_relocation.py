@@ -220,6 +220,7 @@ def test_draws_and_what_is_left_of_them_equal_torch_s(device):
 
 def test_errors_and_opcheck_of_the_ops_of_relocation():
     rows, moments = torch.tensor([1]), [torch.zeros(2, 3) for _ in range(10)]
+    moments[3], moments[8] = torch.zeros(2), torch.zeros(2)
     shared = (torch.zeros(2), torch.zeros(2, 3), moments, rows, torch.tensor([3]), -2.0)
     torch.library.opcheck(torch.ops.blitzgs.share_rows_, shared)
     torch.library.opcheck(torch.ops.blitzgs.overlap, (torch.rand(3).double(), torch.tensor([1, 2, 3])))
@@ -237,6 +238,8 @@ def test_errors_and_opcheck_of_the_ops_of_relocation():
         share_rows_(*shared[:2], moments[1:], *shared[3:])
     with pytest.raises(RuntimeError, match=r"a moment must have 2 rows, got \[3, 3\]"):
         share_rows_(*shared[:2], [torch.zeros(3, 3), *moments[1:]], *shared[3:])
+    with pytest.raises(RuntimeError, match=r"a moment of the opacity must have shape \[2\], got \[2, 3\]"):
+        share_rows_(*shared[:2], [*moments[:8], torch.zeros(2, 3), moments[9]], *shared[3:])
 
 
 @pytest.mark.parametrize("copies", [2, 5, 30])
