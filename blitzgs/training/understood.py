@@ -343,20 +343,22 @@ class Estimate:
     """What a training takes, within a factor of 2 to 3."""
 
     gaussians: int  # at most
+    kept: int  # in the end
     device_bytes: int  # memory of the GPU; 0 on a CPU
     host_bytes: int  # memory of the host
     minutes: float  # of training
     images: int  # that the run trains on
 
     def __str__(self) -> str:
-        digits = max(0, len(str(self.gaussians)) - 2)
+        most, kept = (f"{round(n, 2 - len(str(n))):,}" for n in (self.gaussians, self.kept))
+        in_the_end = f" ({kept} in the end)" if self.kept < self.gaussians else ""
         memory = f"{self.host_bytes / 1e9:.1f} GB of memory"
         if self.device_bytes:
             memory = f"{self.device_bytes / 1e9:.1f} GB on the GPU, {memory}"
+        minutes = max(1, round(self.minutes))
         return (
-            f"about {round(self.gaussians, -digits):,} Gaussians at most, {memory} and "
-            f"{max(1, round(self.minutes)):,} minutes for {self.images:,} images (rough: time within a "
-            "factor of 3, memory of 2)"
+            f"about {most} Gaussians at most{in_the_end}, {memory} and {minutes:,} minutes for "
+            f"{self.images:,} images (rough: time within a factor of 3, memory of 2)"
         )
 
 
@@ -377,8 +379,10 @@ def estimate(config: Config, capture: Capture, on_gpu: bool, cores: int) -> Esti
     # A limit ends the growth; but for `max_gaussians` it removes nothing.
     most = max(first, limit.count if limit is not None else _DENSITY_GROWTH * len(capture.points))
     schedule = Schedule(stretched(config.schedule, len(capture.train)))
+    has_pass = population.importance and len(capture.train) >= population.pass2_views
+    share = population.pass2_keep if has_pass else 1.0
     if population.strategy == "relocation":
-        most, mean = _grown(first, most, population.growth, schedule)
+        most, mean = _grown(first, most, population.growth, share, schedule)
     else:
         mean = most
     pixels = schedule.batch_size * max(sizes)
@@ -391,6 +395,7 @@ def estimate(config: Config, capture: Capture, on_gpu: bool, cores: int) -> Esti
     program = _CUDA_PROGRAM_BYTES if on_gpu else _PROGRAM_BYTES
     return Estimate(
         gaussians=most,
+        kept=int(share * most),
         device_bytes=model if on_gpu else 0,
         host_bytes=program + photographs + (0 if on_gpu else model),
         minutes=config.schedule.minutes or minutes,
@@ -398,11 +403,16 @@ def estimate(config: Config, capture: Capture, on_gpu: bool, cores: int) -> Esti
     )
 
 
-def _grown(first: int, most: int, growth: float, schedule: Schedule) -> tuple[int, float]:
-    """Return the last and the mean number of Gaussians of a run whose events add a share `growth`."""
-    count, total, begin = float(first), 0.0, 0
+def _grown(first: int, most: int, growth: float, share: float, schedule: Schedule) -> tuple[int, float]:
+    """Return the largest and the mean number of Gaussians of a run.
+
+    Density events add the share `growth`, and the second importance pass keeps `share`.
+    """
+    count, total, begin, peak = float(first), 0.0, 0, 0.0
     for event in schedule.events(0, schedule.iterations):
-        if event.kind == "densify":
+        if event.kind in ("densify", "pass_2"):
             total += count * (event.time - begin)
-            begin, count = event.time, min(float(max(most, first)), count * (1 + growth))
-    return int(count), (total + count * (schedule.iterations - begin)) / schedule.iterations
+            grown = min(float(max(most, first)), count * (1 + growth))
+            begin, count = event.time, grown if event.kind == "densify" else share * count
+            peak = max(peak, count)
+    return int(max(peak, first)), (total + count * (schedule.iterations - begin)) / schedule.iterations

@@ -300,6 +300,17 @@ def test_growth_ends_at_the_limit_and_its_mean_is_over_images():
     times = {"iterations": 100, "densify_from": 10, "densify_until": 40, "densify_every": 10, "scale": 1.0}
     schedule = Schedule(dataclasses.replace(Config().schedule, **times, batch_size=1))
     assert [e.time for e in schedule.events(0, 100) if e.kind == "densify"] == [10, 20, 30]
-    most, mean = _grown(100, 130, 0.2, schedule)
+    most, mean = _grown(100, 130, 0.2, 1.0, schedule)
     assert (most, mean) == (130, pytest.approx((10 * 100 + 10 * 120 + 80 * 130) / 100))
-    assert _grown(100, 10**6, 0.2, schedule)[0] == 172
+    assert _grown(100, 10**6, 0.2, 1.0, schedule)[0] == 172
+    with_pass = Schedule(dataclasses.replace(Config().schedule, **times, batch_size=1, t1=0, t2=40))
+    most, mean = _grown(100, 130, 0.2, 0.5, with_pass)
+    assert (most, mean) == (130, pytest.approx((10 * 100 + 10 * 120 + 20 * 130 + 60 * 65) / 100))
+
+
+@pytest.mark.parametrize(
+    ("views", "said"), [(VIEWS, "400 Gaussians at most (200 in the end), "), (50, "400 Gaussians at most, ")]
+)
+def test_what_a_pass_keeps_is_said(loaded, views, said):
+    passes = "population.importance=true", "population.pass2_keep=0.5", f"population.pass2_views={views}"
+    assert said in str(estimate(config_of("population.max_gaussians=400", *passes), loaded, False, 2))
