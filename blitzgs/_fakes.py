@@ -215,7 +215,7 @@ _FAKES: dict[str, Callable[[Arguments], Any]] = {
     "splats_of_arranged": lambda a: [
         t.new_empty(len(a.places[0]), *t.shape[len(a.shape) :]) for t in a.arranged
     ],
-    "sum_splats": lambda a: [a.values.new_empty(a.splats, width) for width in a.widths],
+    "sum_splats": lambda a: [a.values[0].new_empty(a.splats, width) for width in a.widths],
     "unscented_bwd": _unscented_bwd,
     "unscented_fwd": _unscented_fwd,
     "unscented_visible": lambda a: a.viewmats.new_empty(

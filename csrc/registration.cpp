@@ -64,16 +64,15 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "radius_clip, bool antialiased, bool raw, float[] fade, Tensor[] v_splats, Tensor? v_depths, bool "
       "need_viewmats, bool dense=False) -> (Tensor v_means, Tensor v_quats, Tensor v_scales, Tensor "
       "v_opacities, Tensor v_sh, Tensor v_viewmats)");
-  // project_bwd, then lazy_adam_step_ of the visible Gaussians. With places, v_splats are the tables of the
-  // ranks that composited the splats. Groups of the optimiser, as blitzgs/ops/lazy_adam.py names them: state
-  // (params, exp_avgs, exp_avg_sqs, last_step, moment_step); tables (table, lr_table[, final_rules]).
+  // project_bwd, then lazy_adam_step_ of the visible Gaussians. blitzgs/ops/lazy_adam.py has the groups of
+  // the optimiser: state (params, exp_avgs, exp_avg_sqs, last_step, moment_step); tables (table, lr_table[,
+  // final_rules]).
   m.def(
       "project_bwd_step_(Tensor(a!)[] state, Tensor[] tables, int step, int explicit_steps, float beta1, "
       "float beta2, float eps, Tensor viewmats, Tensor Ks, Tensor? scale_reg, Tensor? opacity_reg, Tensor "
       "camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor? level, int width, int height, int "
       "tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, bool "
-      "antialiased, bool raw, float[] fade, Tensor[] v_splats, Tensor? places=None, Tensor(b!)? "
-      "means2d_sums=None) -> ()");
+      "antialiased, bool raw, float[] fade, Tensor[] v_splats) -> ()");
   // The unscented projection (csrc/project/unscented.h), with the options of the projection. lenses [B, 13]:
   // k1 to k6, p1, p2, s1 to s4, the largest angle of a fisheye; shutter: 0 to 4, and viewmats_rs unless it is
   // 4 (global); transform: alpha, beta, kappa, margin, all_valid. unscented_visible finds which Gaussians
@@ -113,9 +112,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "scatter_splats(Tensor[] columns, Tensor masks, int[] group_sizes) -> (Tensor packed, Tensor places)");
   m.def("gather_splats(Tensor packed, int[] widths, int[] group_sizes) -> Tensor[] columns");
-  m.def(
-      "sum_splats(Tensor values, Tensor places, int[] group_sizes, int splats, int[] widths) -> Tensor[] "
-      "columns");
+  m.def("sum_splats(Tensor[] values, Tensor places, int splats, int[] widths) -> Tensor[] columns");
   m.def(
       "send_splats_(Tensor[] columns, Tensor rank_masks, Tensor everyone, int rank, Tensor(a!)[] buffers, "
       "int capacity) -> (Tensor places, Tensor plan)");

@@ -19,7 +19,6 @@ from torch import Tensor
 
 import blitzgs
 from benchmarks.gradients import parameter_gradients as parameter_gradients
-from benchmarks.gradients import sum_of_ranks as sum_of_ranks
 from blitzgs.formats.gaussians import Gaussians
 from blitzgs.formats.models import FORMATS
 from blitzgs.ops.photometric import report_

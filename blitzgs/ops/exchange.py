@@ -11,7 +11,7 @@ from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 
-# Consecutive splats, a run, that share an entry of `places`: kPlaceSplats of csrc/exchange/places.h.
+# Consecutive splats, a run, that share an entry of `places`: kPlaceSplats of csrc/exchange/scatter.h.
 PLACE_SPLATS = 32
 
 

@@ -277,7 +277,6 @@ def project_bwd_step_(
     options: ProjectionOptions,
     gradients: SplatGradients,
     level: Tensor | None = None,
-    means2d_sums: Tensor | None = None,
 ) -> None:
     """Take Adam step ``step`` for the visible Gaussians, in place, with the gradients of their splats.
 
@@ -295,7 +294,6 @@ def project_bwd_step_(
         splats: the P splats that `project` returned for these parameters and views.
         options: the options of the projection; scales and opacities are taken before their activation.
         level: uint8 [N], octree levels, if opacities fade with them (`options.fade`).
-        means2d_sums: [P, 2], receives the gradient of `splats.means2d` if `gradients` has a part per rank.
     """
     with below_autograd():
         torch.ops.blitzgs.project_bwd_step_(
@@ -309,6 +307,4 @@ def project_bwd_step_(
             level,
             *options,
             gradients.parts,
-            gradients.places,
-            means2d_sums,
         )

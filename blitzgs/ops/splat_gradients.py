@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gradients of projected splats, in the three layouts in which compositing hands them to the projection."""
+"""Gradients of projected splats, in the two layouts in which compositing hands them to the projection."""
 
 from __future__ import annotations
 
@@ -50,42 +50,33 @@ def gradient_table_of(columns: Sequence[Tensor | None]) -> Tensor | None:
 
 
 class SplatGradients(NamedTuple):
-    """Gradients of P splats in one of three forms."""
+    """Gradients of P splats in one of two forms."""
 
     # Columns (v_means2d [P, 2], v_conics [P, 3], v_opacities [P], v_colors [P, 3]); or (CUDA) one table [P,
-    # 12]; or, with `places`, this rank's part of such a table at each of the M ranks that composited splats,
-    # in memory that the ranks share. A splat's gradient is then the sum over the ranks, in their order.
+    # 12].
     parts: Sequence[Tensor]
-    # int64 [ceil(P / 32), M], the position of each splat in each rank's part of the table, as
-    # `scatter_splats` returns it. Such gradients are valid until the next frame, or the next backward pass of
-    # this one.
-    places: Tensor | None = None
 
     @property
-    def means2d(self) -> Tensor | None:
-        """The gradient of means2d, [P, 2] per pixel; None if its parts are at several ranks."""
-        if self.places is not None:
-            return None
+    def means2d(self) -> Tensor:
+        """The gradient of means2d, [P, 2] per pixel."""
         first = self.parts[0]
         return first[:, _MEAN2D : _MEAN2D + 2] if len(self.parts) == 1 else first
 
     def side_by_side(self) -> Tensor:
-        """Return all columns as one [P, 9]; for gradients without `places`."""
+        """Return all columns as one [P, 9]."""
         flat = [column.reshape(len(column), math.prod(column.shape[1:])) for column in self._columns()]
         return torch.cat(flat, 1)
 
-    def sum_returned(
-        self, values: Tensor, places: Tensor, group_sizes: Sequence[int], splats: int
-    ) -> SplatGradients:
+    def sum_returned(self, values: Sequence[Tensor], places: Tensor, splats: int) -> SplatGradients:
         """Return the gradients of a rank's own splats, summed over the ranks in their order.
 
-        `values`: [sum(group_sizes), F], the rows of each rank's `side_by_side` for this rank's splats.
-        `places` and `group_sizes`: from and for `blitzgs.ops.exchange.scatter_splats`. `splats`: P. The
-        gradients of splats that went nowhere are zero.
+        `values`: [n, F] of each rank, the rows of its `side_by_side` for this rank's splats. `places`: from
+        `blitzgs.ops.exchange.scatter_splats`. `splats`: P. The gradients of splats that went nowhere are
+        zero.
         """
         columns = self._columns()
         widths = [math.prod(column.shape[1:]) for column in columns]
-        sums = torch.ops.blitzgs.sum_splats(values, places, list(group_sizes), splats, widths)
+        sums = torch.ops.blitzgs.sum_splats(values, places, splats, widths)
         return SplatGradients(
             [total.reshape(-1, *like.shape[1:]) for total, like in zip(sums, columns, strict=True)]
         )

@@ -85,15 +85,13 @@ class TableAdam:
         scale_reg: Tensor | None,
         opacity_reg: Tensor | None,
         step: int,
-        means2d_sums: Tensor | None = None,
     ) -> None:
         """Take step number `step` (from 1) for the Gaussians that a frame shows.
 
         `table`: the one that was rendered, unchanged since; its visible rows must be current up to
         `step` - 1. `gradients`: of the frame's splats, from `frame.backward_splats`. `scale_reg`,
         `opacity_reg`: weights per view, [B], of the smallest axis and of the opacity of each Gaussian visible
-        in it; None: no such term. `means2d_sums`: [P, 2], receives the gradient of the splats' means2d if its
-        parts are at several ranks.
+        in it; None: no such term.
         """
         project_bwd_step_(
             _state_of(table),
@@ -104,7 +102,6 @@ class TableAdam:
             frame.options.projection(frame.views),
             gradients,
             table["level"] if frame.options.fade else None,
-            means2d_sums,
         )
 
 

@@ -132,16 +132,10 @@ class Stepper:
         """
         table = self.table
         gradients = backward_splats(frame, terms.v_renders)
-        v_means2d = means2d_sums = None
-        if keep_means2d:
-            v_means2d = gradients.means2d
-            if v_means2d is None:
-                # The gradients are in the memory of several ranks. The optimiser's kernel adds them up.
-                v_means2d = means2d_sums = torch.empty_like(frame.projected.means2d)
-        self._optimiser.step(table, frame, gradients, terms.scale_reg, terms.opacity_reg, step, means2d_sums)
+        self._optimiser.step(table, frame, gradients, terms.scale_reg, terms.opacity_reg, step)
         if self._noise is not None:
             self._noise.add(table, frame.projected.visible_ids, step, self._optimiser.position_rate(step))
         stage_ended("optimiser")
         self._blocks.update(table, frame.projected.visible_ids)
         stage_ended("other")
-        return v_means2d
+        return gradients.means2d if keep_means2d else None

@@ -93,14 +93,6 @@ struct alignas(16) SplatGradient {
   float mean2d[2], conic[3], opacity;
   float color[4];       // up to four channels; zeros after the last
   float mean2d_abs[2];  // sums over pixels of the absolute gradients of mean2d, if absgrad is set
-
-  BLITZGS_HD void add(const SplatGradient& v) {
-    for (int i = 0; i < 2; ++i) mean2d[i] += v.mean2d[i];
-    for (int i = 0; i < 3; ++i) conic[i] += v.conic[i];
-    opacity += v.opacity;
-    for (int i = 0; i < 3; ++i) color[i] += v.color[i];
-    for (int i = 0; i < 2; ++i) mean2d_abs[i] += v.mean2d_abs[i];
-  }
 };
 
 inline constexpr std::int64_t kSplatGradient = sizeof(SplatGradient) / sizeof(float);

@@ -5,7 +5,7 @@
 #include "exchange/scatter.h"
 #include "exchange/tile_costs.h"
 #include "exchange/transport.h"
-#include "project/project_op.h"
+#include "project/project.h"
 
 namespace blitzgs {
 namespace {
@@ -112,21 +112,31 @@ std::vector<Tensor> gather_splats(const Tensor& packed, const std::vector<std::i
   return found;
 }
 
-std::vector<Tensor> sum_splats(const Tensor& values, const Tensor& places,
-                               const std::vector<std::int64_t>& group_sizes, std::int64_t splats,
-                               const std::vector<std::int64_t>& widths) {
+std::vector<Tensor> sum_splats(const std::vector<Tensor>& values, const Tensor& places_in,
+                               std::int64_t splats, const std::vector<std::int64_t>& widths) {
   constexpr const char* kOp = "sum_splats";
   BLITZGS_CHECK(splats >= 0, kOp, "splats must not be negative, got ", splats);
-  check_floating(kOp, "values", values);
-  const SplatGroups groups = checked_groups(kOp, "group_sizes", group_sizes);
-  const auto held = checked_places(kOp, places, splats, groups.count);
-  DeviceScope scope(values);
-  return dispatch_floating(values, [&]<class T>() {
+  const auto n_ranks = static_cast<std::int64_t>(values.size());
+  BLITZGS_CHECK(n_ranks >= 1 && n_ranks <= kMaxRanks, kOp, "values must have 1 to ", kMaxRanks,
+                " entries, got ", n_ranks);
+  check_floating(kOp, "values", values[0]);
+  const auto places = checked<std::int64_t>(kOp, "places", places_in, {place_runs(splats), n_ranks});
+  DeviceScope scope(values[0]);
+  return dispatch_floating(values[0], [&]<class T>() {
     SplatColumns<T> columns{};
-    std::vector<Tensor> sums = make_columns(kOp, columns, values, splats, widths);
-    const int width = columns.begin[columns.count];
-    const auto contiguous = checked<T>(kOp, "values", values, {total_splats(groups), width});
-    backend::sum(SplatValues<T>{contiguous, width, splats, places_in(held), groups}, columns, scope.stream);
+    std::vector<Tensor> sums = make_columns(kOp, columns, values[0], splats, widths);
+    SplatValues<T> in{};
+    in.n_ranks = static_cast<int>(n_ranks);
+    in.width = columns.begin[columns.count];
+    in.count = splats;
+    in.places = reinterpret_cast<const SplatPlace*>(places.data());
+    std::vector<Values<const T>> held;
+    for (std::int64_t m = 0; m < n_ranks; ++m) {
+      held.push_back(checked<T>(kOp, "values of a rank", values[m], {-1, in.width}));
+      in.values[m] = held.back();
+      in.size[m] = held.back().size(0);
+    }
+    backend::sum(in, columns, scope.stream);
     return sums;
   });
 }

@@ -62,8 +62,12 @@ TEST_CASE("scattered splats arrive in order, and their sums return", "[scatter]"
     values[3 * i + 1] = weight;
     values[3 * i + 2] = 2 * weight;
   }
-  cpu::sum<double>({values.data(), 3, n, places.data(), groups}, {{x.data(), y.data()}, {0, 1, 3}, 2},
-                   nullptr);
+  SplatValues<double> back{{}, {}, n_ranks, 3, n, places.data()};
+  for (int m = 0; m < n_ranks; ++m) {
+    back.values[m] = values.data() + 3 * groups.start[m];
+    back.size[m] = groups.size[m];
+  }
+  cpu::sum<double>(back, {{x.data(), y.data()}, {0, 1, 3}, 2}, nullptr);
   for (int i = 0; i < n; ++i) {
     const double weight = (masks[i] & 1 ? 1.0 : 0.0) + (masks[i] & 4 ? 10.0 : 0.0);
     REQUIRE(x[i] == weight * b[i]);

@@ -8,17 +8,42 @@
 //            block of kScatterBlock splats keep their order in a group, but blocks may come in any order. The
 //            places are all that the sender needs to find its splats' gradients again.
 //   gather:  the groups that arrived, one after the other -> columns.
-//   sum:     values [S, F], groups in the layout of `scatter` one after the other -> columns [P, w], the sum
-//            over the groups of each splat in the order of ranks, starting from zero: deterministic.
+//   sum:     values [S, F] of each group -> columns [P, w], the sum over the groups of each splat in the
+//   order
+//            of ranks, starting from zero: deterministic. On CUDA the values may be in the memory of the GPUs
+//            that composited the splats.
 //
 // The cost is O(words moved). Splats beyond the given size of a group are dropped, whatever the masks say.
 #pragma once
 #include <cstdint>
 
 #include "common/kernel.h"
-#include "exchange/places.h"
 
 namespace blitzgs {
+
+constexpr int kPlaceSplats = 32;
+
+inline std::int64_t place_runs(std::int64_t splats) { return (splats + kPlaceSplats - 1) / kPlaceSplats; }
+
+BLITZGS_HD int count_bits(std::uint32_t bits) {
+#ifdef __CUDA_ARCH__
+  return __popc(bits);
+#else
+  return __builtin_popcount(bits);
+#endif
+}
+
+// The splats of a run (of kPlaceSplats consecutive ones) that went to one rank. The ops pass it as an int64.
+struct alignas(8) SplatPlace {
+  std::int32_t first;  // the position of the first of them in the rank's group
+  std::uint32_t bits;  // bit i: splat i of the run is one of them
+
+  // splat: the index in the run, in [0, kPlaceSplats).
+  BLITZGS_HD bool has(std::uint32_t splat) const { return (bits >> splat) & 1u; }
+  BLITZGS_HD std::int64_t of(std::uint32_t splat) const {
+    return first + count_bits(bits & ((1u << splat) - 1u));
+  }
+};
 
 constexpr int kScatterBlock = 256;
 constexpr int kMaxSplatColumns = 8;
@@ -63,31 +88,31 @@ struct ScatterSplats {
   std::int64_t count;
 };
 
-// Values of splats, `width` per splat, that came back from each rank that a splat went to.
+// Values of the splats that went to each rank: `size` rows of `width` values.
 template <class T>
 struct SplatValues {
-  const T* values;
-  int width;
-  std::int64_t count;
-  const SplatPlace* places;
-  SplatGroups groups;
+  const T* values[kMaxRanks];
+  std::int64_t size[kMaxRanks];
+  int n_ranks, width;
+  std::int64_t count;        // the splats of this rank
+  const SplatPlace* places;  // where in each rank's rows they are
 
   // Calls f(pointer to the splat's values from a rank) for each rank that the splat went to, in order.
   template <class F>
   BLITZGS_HD void for_each(std::uint64_t splat, const F& f) const {
-    const SplatPlace* run = places + splat / kPlaceSplats * groups.count;
+    const SplatPlace* run = places + splat / kPlaceSplats * n_ranks;
     const auto in_run = static_cast<std::uint32_t>(splat % kPlaceSplats);
     std::uint64_t ranks = 0;
 #ifdef __CUDA_ARCH__
 #pragma unroll 4  // four loads at a time; the compiler would choose 16
 #endif
-    for (int m = 0; m < groups.count; ++m) ranks |= std::uint64_t{run[m].has(in_run)} << m;
+    for (int m = 0; m < n_ranks; ++m) ranks |= std::uint64_t{run[m].has(in_run)} << m;
     // Most splats went to a single rank. With this loop the threads of a warp load their first values
     // together.
     for (; ranks != 0; ranks &= ranks - 1) {
       const int m = lowest_bit(ranks);
       const std::int64_t at = run[m].of(in_run);
-      if (at < groups.size[m]) f(values + (groups.start[m] + at) * width);
+      if (at < size[m]) f(values[m] + at * width);
     }
   }
 };

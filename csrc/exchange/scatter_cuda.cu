@@ -91,6 +91,29 @@ __global__ void __launch_bounds__(kSumThreads) sum_kernel(const __grid_constant_
   }
 }
 
+// The same for values that are SplatGradients, to one column of them: one thread per 16 bytes, so that a warp
+// reads whole lines, which may be in the memory of another GPU.
+constexpr int kGradientPieces = kSplatGradient / 4, kGradientSplats = 128;
+
+__global__ void __launch_bounds__(kGradientPieces* kGradientSplats)
+    sum_gradients_kernel(const __grid_constant__ SplatValues<float> in, float4* out) {
+  const int piece = threadIdx.x % kGradientPieces;
+  const std::int64_t splat = blockIdx.x * std::int64_t{kGradientSplats} + threadIdx.x / kGradientPieces;
+  if (splat >= in.count) return;
+  float4 sum{};
+  in.for_each(splat, [&](const float* from) {
+    const float4 v = reinterpret_cast<const float4*>(from)[piece];
+    sum = {sum.x + v.x, sum.y + v.y, sum.z + v.z, sum.w + v.w};
+  });
+  out[splat * kGradientPieces + piece] = sum;
+}
+
+bool are_gradients(const SplatValues<float>& in, const SplatColumns<float>& out) {
+  const auto aligned = [](const float* p) { return reinterpret_cast<std::uintptr_t>(p) % 16 == 0; };
+  return in.width == kSplatGradient && out.count == 1 && aligned(out.data[0]) &&
+         std::all_of(in.values, in.values + in.n_ranks, aligned);
+}
+
 }  // namespace
 
 void scatter(const ScatterSplats& splats, const SplatGroups& groups, const ScatterTargets& targets,
@@ -118,6 +141,12 @@ void gather(const std::int32_t* packed, const SplatGroups& groups, const SplatCo
 template <>
 void sum<float>(const SplatValues<float>& in, const SplatColumns<float>& out, CudaStream stream) {
   if (in.count == 0 || in.width == 0) return;
+  if (are_gradients(in, out)) {
+    sum_gradients_kernel<<<blocks_for(in.count, kGradientSplats), kGradientPieces * kGradientSplats, 0,
+                           stream>>>(in, reinterpret_cast<float4*>(out.data[0]));
+    check_launch("sum_splats");
+    return;
+  }
   const unsigned blocks = blocks_for(in.count, kSumThreads);
   if (in.width == kSplatValues) {
     sum_kernel<kSplatValues, true><<<blocks, kSumThreads, 0, stream>>>(in, out);

@@ -7,8 +7,8 @@
 // capacity * kSentColumns.begin[c]. If any rank has, sends or receives more than `capacity` splats, which all
 // see in the totals, no rank writes any.
 //
-// The gradients need no op for their way back: in the projection's backward pass the owner of the splats
-// reads them from the tables of the ranks that composited the splats (RankSplatGradients, project/project.h).
+// For the way back, the owner of the splats sums their gradients, which it reads in the tables of the ranks
+// that composited the splats (sum in scatter.h).
 //
 // device_barrier_ is a barrier in stream order: all work that any rank queued before its barrier is done, and
 // its writes are visible, before work that any rank queues after its barrier runs. Each rank also sends its

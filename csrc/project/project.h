@@ -34,7 +34,6 @@
 
 #include "adam/lazy_adam.h"
 #include "common/kernel.h"
-#include "exchange/places.h"
 #include "math/tiles.h"
 #include "project/project_splat.h"
 
@@ -65,7 +64,7 @@ BLITZGS_HD float inverse_reach2_of(const LevelFade& fade, std::int64_t id) {
   return fade.inverse_reach2[level < last ? level : last];
 }
 
-// The three sources from which the projection's backward pass reads the gradients of the splats: geometry(r)
+// The two sources from which the projection's backward pass reads the gradients of the splats: geometry(r)
 // and color(r) are those of splat r, and colored() says whether there are gradients of colours.
 
 // One array for each attribute: [P, 2], [P, 3], [P], [P], [P, 3]. depths and colors may be null (zero).
@@ -99,48 +98,10 @@ struct PackedSplatGradients {
   }
 };
 
-// One such table on each rank that composited the splats (CUDA). The gradient of a splat is the sum over
-// these tables in the order of the ranks. tables[m] points into the memory of rank m, which is mapped into
-// this process, at the first splat of this rank.
-struct RankSplatGradients {
-  const SplatPlace* places;
-  int n_ranks;
-  const SplatGradient* tables[kMaxPeers];
-  std::int32_t sizes[kMaxPeers];  // the number of this rank's splats in each table
-  float* means2d;                 // null, or [P, 2]: the backward pass writes the sums of v_means2d here
-
-  BLITZGS_HD bool colored() const { return true; }
-  BLITZGS_HD GeometryGradient<float> geometry(std::int64_t r) const {
-    const SplatGradient splat = sum(r);
-    return PackedSplatGradients{&splat}.geometry(0);
-  }
-  BLITZGS_HD Vec3<float> color(std::int64_t r) const {
-    const SplatGradient splat = sum(r);
-    return PackedSplatGradients{&splat}.color(0);
-  }
-  BLITZGS_HD SplatGradient sum(std::int64_t r) const {
-    SplatGradient sum{};
-    for (int m = 0; m < n_ranks; ++m) {
-      const SplatGradient* splat = at(m, r);
-      if (!splat) continue;
-      const SplatGradient v = *splat;
-      sum.add(v);
-    }
-    return sum;
-  }
-  // The gradient of splat r at rank m; null: rank m did not composite the splat.
-  BLITZGS_HD const SplatGradient* at(int m, std::uint64_t r) const {
-    const SplatPlace place = places[r / kPlaceSplats * n_ranks + m];
-    const auto in_run = static_cast<std::uint32_t>(r % kPlaceSplats);
-    const std::int64_t splat = place.of(in_run);
-    return place.has(in_run) && splat < sizes[m] ? tables[m] + splat : nullptr;
-  }
-};
-
 // The source that the kernels of a backend read. The CPU reads columns only.
 #ifdef BLITZGS_BACKEND_CUDA
 template <class T>
-using SplatGradientSource = std::variant<SplatGradientColumns<T>, PackedSplatGradients, RankSplatGradients>;
+using SplatGradientSource = std::variant<SplatGradientColumns<T>, PackedSplatGradients>;
 #else
 template <class T>
 using SplatGradientSource = SplatGradientColumns<T>;

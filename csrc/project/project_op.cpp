@@ -146,20 +146,18 @@ Projected project_fwd(const TensorList& gaussians, const Tensor& viewmats, const
 
 class HeldSplatGradients {
  public:
-  // splats: P. sums: none, or [P, 2], to which the kernel writes the gradients of means2d summed over ranks.
+  // splats: P.
   HeldSplatGradients(const char* op, ScalarType dtype, std::int64_t splats,
-                     const std::vector<Tensor>& v_splats, const std::optional<Tensor>& v_depths,
-                     const std::optional<Tensor>& places, const std::optional<Tensor>& sums)
-      : held_(v_splats), depths_(v_depths), in_tables_(places || v_splats.size() == 1) {
+                     const std::vector<Tensor>& v_splats, const std::optional<Tensor>& v_depths)
+      : held_(v_splats), depths_(v_depths), in_table_(v_splats.size() == 1) {
 #ifndef BLITZGS_BACKEND_CUDA
-    BLITZGS_CHECK(!in_tables_, op, "tables of gradients need CUDA; give columns");
+    BLITZGS_CHECK(!in_table_, op, "a table of gradients needs CUDA; give columns");
 #endif
-    BLITZGS_CHECK(places || !sums, op, "means2d_sums needs gradients at ranks");
-    if (in_tables_) {
+    if (in_table_) {
       BLITZGS_CHECK(!v_depths, op, "v_depths needs gradients in columns");
-      for (const Tensor& table : held_) check_table(op, table);
-      if (!places) check_shape(op, "v_splats[0]", held_[0], {splats, kSplatGradient});
-      if (places) hold_ranks(op, splats, *places, sums);
+      check_in_place(op, "v_splats[0]", held_[0], ScalarType::Float, {splats, kSplatGradient});
+      BLITZGS_CHECK(reinterpret_cast<std::uintptr_t>(held_[0].const_data_ptr()) % alignof(SplatGradient) == 0,
+                    op, "the table of v_splats must begin at a multiple of 16 bytes");
       return;
     }
     BLITZGS_CHECK(v_splats.size() == 3 || v_splats.size() == 4, op,
@@ -176,44 +174,16 @@ class HeldSplatGradients {
   template <class T>
   SplatGradientSource<T> source() const {
 #ifdef BLITZGS_BACKEND_CUDA
-    if (places_) return ranks_;
-    if (in_tables_) return PackedSplatGradients{table(held_[0])};
+    if (in_table_) return PackedSplatGradients{reinterpret_cast<const SplatGradient*>(data<float>(held_[0]))};
 #endif
     return SplatGradientColumns<T>{data<T>(held_[0]), data<T>(held_[1]), data_or_null<T>(depths_),
                                    data<T>(held_[2]), held_.size() == 4 ? data<T>(held_[3]) : nullptr};
   }
 
  private:
-  static const SplatGradient* table(const Tensor& tensor) {
-    return reinterpret_cast<const SplatGradient*>(data<float>(tensor));
-  }
-
-  static void check_table(const char* op, const Tensor& tensor) {
-    check_in_place(op, "a table of v_splats", tensor, ScalarType::Float, {-1, kSplatGradient});
-    BLITZGS_CHECK(reinterpret_cast<std::uintptr_t>(tensor.const_data_ptr()) % alignof(SplatGradient) == 0, op,
-                  "a table of v_splats must begin at a multiple of 16 bytes");
-  }
-
-  void hold_ranks(const char* op, std::int64_t splats, const Tensor& places,
-                  const std::optional<Tensor>& sums) {
-    const auto n_ranks = static_cast<std::int64_t>(held_.size());
-    BLITZGS_CHECK(n_ranks >= 1 && n_ranks <= kMaxPeers, op, "1 to ", kMaxPeers,
-                  " ranks can hold gradients, got ", n_ranks);
-    places_ = checked_places(op, places, splats, n_ranks);
-    ranks_.places = places_in(*places_);
-    ranks_.n_ranks = static_cast<int>(n_ranks);
-    for (std::int64_t m = 0; m < n_ranks; ++m) {
-      ranks_.tables[m] = table(held_[m]);
-      ranks_.sizes[m] = static_cast<std::int32_t>(held_[m].size(0));
-    }
-    if (!sums) return;
-    ranks_.means2d = checked_in_place<float>(op, "means2d_sums", *sums, {splats, 2});
-  }
-
   std::vector<Tensor> held_;
-  std::optional<Tensor> depths_, places_;
-  bool in_tables_;
-  RankSplatGradients ranks_{};
+  std::optional<Tensor> depths_;
+  bool in_table_;
 };
 
 // The outputs of the forward pass that both ops read, and the weights of the regularisers for each view. The
@@ -254,8 +224,7 @@ BackwardTensors project_bwd(const TensorList& gaussians, const Tensor& viewmats,
   const ProjectArguments p(kOp, gaussians, viewmats, Ks,
                            checked_options(kOp, BLITZGS_PROJECT_OPTION_NAMES, fade), fade, level);
   const BackwardSplats b(kOp, p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg);
-  const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, v_depths, std::nullopt,
-                             std::nullopt);
+  const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, v_depths);
   const std::int64_t length = dense ? p.count : b.visible();
   DeviceScope scope(p.means);
   return dispatch_floating(p.means, [&]<class T>() -> BackwardTensors {
@@ -283,16 +252,14 @@ void project_bwd_step(const TensorList& state_in, const TensorList& tables, std:
                       const Tensor& viewmats, const Tensor& Ks, const OptionalTensor& scale_reg,
                       const OptionalTensor& opacity_reg, const Tensor& camera_ids, const Tensor& visible_ids,
                       const Tensor& splat_offsets, const OptionalTensor& level, BLITZGS_PROJECT_OPTIONS,
-                      const FloatList& fade, const TensorList& v_splats, const OptionalTensor& places,
-                      const OptionalTensor& means2d_sums) {
+                      const FloatList& fade, const TensorList& v_splats) {
   constexpr const char* kOp = "project_bwd_step_";
   AdamTensors state(kOp, state_in, tables, {step, explicit_steps, beta1, beta2, eps});
   state.check_takes_step();
   const ProjectArguments p(kOp, state.params, viewmats, Ks,
                            checked_options(kOp, BLITZGS_PROJECT_OPTION_NAMES, fade), fade, level);
   const BackwardSplats b(kOp, p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg);
-  const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, std::nullopt, places,
-                             means2d_sums);
+  const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, std::nullopt);
   if (b.visible() == 0) return;
   DeviceScope scope(p.means);
   dispatch_floating(p.means, [&]<class T>() {

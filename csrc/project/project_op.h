@@ -21,16 +21,6 @@ void check_group(const char* op, const char* names, const List& list, std::size_
                 " entries");
 }
 
-// The places [runs, n_ranks] that scatter_splats returned, checked and contiguous.
-inline Values<const std::int64_t> checked_places(const char* op, const Tensor& places, std::int64_t splats,
-                                                 std::int64_t n_ranks) {
-  return checked<std::int64_t>(op, "places", places, {place_runs(splats), n_ranks});
-}
-
-inline const SplatPlace* places_in(const Tensor& places) {
-  return reinterpret_cast<const SplatPlace*>(data<std::int64_t>(places));
-}
-
 // The options of the projection as the ops take them, and as arguments of checked_options.
 #define BLITZGS_PROJECT_OPTIONS                                                            \
   std::int64_t width, std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree, \

@@ -4,7 +4,6 @@ import math
 import pytest
 import torch
 
-from blitzgs.ops.exchange import scatter_splats
 from blitzgs.ops.lazy_adam import (
     AdamSchedule,
     AdamState,
@@ -14,8 +13,8 @@ from blitzgs.ops.lazy_adam import (
 )
 from blitzgs.ops.project import project
 from blitzgs.ops.projection_types import ProjectionOptions, WeightedViews
-from blitzgs.ops.splat_gradients import SplatGradients, gradient_columns
-from tests.helpers import BACKENDS, DEVICES, needs_cuda, refused, sum_of_ranks
+from blitzgs.ops.splat_gradients import SplatGradients
+from tests.helpers import BACKENDS, DEVICES, needs_cuda, refused
 
 BETA1, BETA2, EPS = 0.9**2, 0.999**2, 1e-15 / math.sqrt(2)
 STEP, WIDTH, HEIGHT, EPS2D = 70, 90, 60, 0.3
@@ -82,10 +81,9 @@ class Scene:
         *gradients, _ = self.backward()
         lazy_adam_step_(self.state, self.schedule(), STEP, gradients, self.splats.visible_ids)
 
-    def at_once(self, means2d_sums=None):
+    def at_once(self):
         project_bwd_step_(
-            self.state, self.schedule(), STEP, self.views(), self.splats, self.options, self.v,
-            means2d_sums=means2d_sums,
+            self.state, self.schedule(), STEP, self.views(), self.splats, self.options, self.v
         )  # fmt: skip
 
     def pack(self, width):
@@ -97,24 +95,6 @@ class Scene:
             self.v = SplatGradients([table])
         else:  # columns that are not contiguous
             self.v = SplatGradients([table[:, :2], table[:, 2:5], table[:, 5], table[:, 6:9]])
-
-    def spread(self):
-        """Replace the gradients by random ones in the tables of several ranks; return their sums."""
-        splats, starts, ranks = len(self.splats.camera_ids), [5, 0, 900, 1], 4
-        masks = torch.randint(0, 2**ranks, (splats,), generator=self.seed) & ~2  # rank 1 had nothing
-        alone = torch.rand(splats, generator=self.seed) < 0.6  # as most splats are
-        masks[alone] = 2 ** (2 * (masks[alone] % 2))
-        sizes = [int((masks >> m & 1).sum()) for m in range(ranks)]
-        numbers = torch.arange(splats, dtype=torch.int32, device=self.splats.means2d.device)
-        _, places = scatter_splats([numbers], masks.to(numbers.device), sizes)
-        parts = []
-        for start, size in zip(starts, sizes, strict=True):
-            table = torch.full((start + size + 1, 12), torch.nan)
-            table[start : start + size] = torch.randn(size, 12, generator=self.seed)
-            parts.append(table.to(numbers.device)[start : start + size])
-        self.v = SplatGradients(parts, places)
-        sums = gradient_columns(sum_of_ranks(self.v, splats))
-        return SplatGradients([column.contiguous() for column in sums])
 
 
 def compare(a, b, exact):
@@ -158,37 +138,12 @@ def test_gradients_are_read_where_they_are(device, width, n, k, degree, views):
     """Gradients in the columns of one table give the same result as separate tensors."""
     plain, other = (Scene(n, k, views, device, degree=degree) for _ in range(2))
     other.pack(width)
-    agree(plain, other, device == "cpu")
-
-
-@pytest.mark.cuda
-@needs_cuda
-@pytest.mark.parametrize(
-    "n,k,degree,views",
-    [
-        (1, 16, 3, 1), (3000, 16, 3, 3), (3001, 16, 3, 4), (700, 16, 2, 1), (700, 4, 1, 2), (700, 16, 0, 1),
-        (70, 16, 3, 12), (500, 25, 3, 32),
-    ],
-)  # fmt: skip
-def test_gradients_are_read_from_the_tables_of_several_ranks(n, k, degree, views):
-    """Gradients in the tables of several ranks give the same result as tensors of their sums."""
-    plain, other = (Scene(n, k, views, "cuda", degree=degree) for _ in range(2))
-    assert n == 1 or len(plain.splats.camera_ids) > 2 * n * views // 3  # more than a warp holds at many views
-    plain.v = other.spread()
-    sums = torch.full_like(plain.splats.means2d, torch.nan)
-    agree(plain, other, False, sums)
-    assert torch.equal(sums, plain.v.parts[0])
-
-
-def agree(plain, other, exact, means2d_sums=None):
-    """Compare backward passes, and steps."""
-    if other.v.places is None:  # only the step reads gradients at ranks
-        for x, y in zip(plain.backward(True), other.backward(True), strict=True):
-            assert len(x) and (torch.equal(x, y) or not exact)
-            torch.testing.assert_close(x, y, rtol=1e-5, atol=2e-6 * float(x.abs().max()))
+    for x, y in zip(plain.backward(True), other.backward(True), strict=True):
+        assert len(x) and (torch.equal(x, y) or device != "cpu")
+        torch.testing.assert_close(x, y, rtol=1e-5, atol=2e-6 * float(x.abs().max()))
     plain.at_once()
-    other.at_once(means2d_sums)
-    compare(plain, other, exact)
+    other.at_once()
+    compare(plain, other, device == "cpu")
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -253,30 +208,25 @@ def test_errors_name_what_is_wrong_with_weights():
 
 def test_errors_name_what_is_wrong_with_tables():
     scene = Scene(20, 16, 1)
-    scene.spread()
-    refused(RuntimeError, "project_bwd_step_: tables of gradients need CUDA", scene.at_once)
-    scene.render()
-    del scene.v.parts[1:3]
+    whole = scene.v
+    scene.v = SplatGradients([torch.zeros(len(whole.parts[0]), 12)])
+    refused(RuntimeError, "project_bwd_step_: a table of gradients needs CUDA", scene.at_once)
+    scene.v = SplatGradients([whole.parts[0], whole.parts[3]])
     refused(RuntimeError, "v_splats must be v_means2d, .* or one table, got 2 tensors", scene.backward)
-    scene.render()
-    with pytest.raises(RuntimeError, match="means2d_sums needs gradients at ranks"):
-        scene.at_once(torch.zeros_like(scene.splats.means2d))
 
 
 @pytest.mark.cuda
 @needs_cuda
 def test_errors_name_what_does_not_fit():
     scene = Scene(20, 16, 1, "cuda")
-    scene.spread()
-    whole = scene.v
-    for change, text in (
-        ({"places": whole.places[:, :-1]}, r"places must have shape \[\d+, 4\], got \[\d+, 3\]"),
-        ({"parts": whole.parts[:3]}, r"places must have shape \[\d+, 3\], got \[\d+, 4\]"),
-        ({"parts": [part[:, :9] for part in whole.parts]}, r"must have shape \[\*, 12\], got \[\d+, 9\]"),
-        ({"parts": [part.double() for part in whole.parts]}, "must be Float, got Double"),
-        ({"parts": [part.t().contiguous().t() for part in whole.parts]}, "must be contiguous"),
+    table = torch.zeros(len(scene.splats.means2d), 12, device="cuda")
+    for wrong, text in (
+        (table[:-1], r"v_splats\[0\] must have shape \[\d+, 12\], got \[\d+, 12\]"),
+        (table[:, :9], r"must have shape \[\d+, 12\], got \[\d+, 9\]"),
+        (table.double(), "must be Float, got Double"),
+        (table.t().contiguous().t(), "must be contiguous"),
     ):
-        scene.v = whole._replace(**change)
+        scene.v = SplatGradients([wrong])
         refused(RuntimeError, text, scene.at_once)
 
 

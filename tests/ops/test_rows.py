@@ -201,17 +201,18 @@ def test_splats_reach_their_groups(n, device):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("n", [0, 1, 5000])
-def test_sums_follow_the_splats_back(n, device):
+@pytest.mark.parametrize("widths", [[2, 0, 17, 1], [12]])  # 12: on CUDA read by whole rows, as from peers
+def test_sums_follow_the_splats_back(n, widths, device):
     masks, sizes = destinations(n)
     numbers = torch.arange(n, dtype=torch.int32)
     packed, places = scatter_splats([numbers.to(device)], masks.to(device), sizes)
     splats = packed.cpu().long()
-    values = torch.randn(len(splats), 20, generator=torch.Generator().manual_seed(2))
-    expected = torch.zeros(n, 20)
+    values = torch.randn(len(splats), sum(widths), generator=torch.Generator().manual_seed(2))
+    expected = torch.zeros(n, sum(widths))
     for part, group in zip(values.split(sizes), splats.split(sizes), strict=True):
         expected[group] += part
-    got = sum_splats(values.to(device), places, sizes, n, [2, 0, 17, 1])
-    assert [part.shape[1] for part in got] == [2, 0, 17, 1]
+    got = sum_splats(values.to(device).split(sizes), places, n, widths)
+    assert [part.shape[1] for part in got] == widths
     assert torch.equal(torch.cat(got, 1).cpu(), expected)
 
 
@@ -223,7 +224,7 @@ def test_doubles_and_strided_columns_are_scattered():
     for got, column in zip(gather_splats(packed, data, [2, 2]), data, strict=True):
         assert torch.equal(got, column[[0, 2, 2, 3]])
     values = torch.arange(4, dtype=torch.float64)[:, None]
-    assert sum_splats(values, places, [2, 2], 4, [1])[0].squeeze(1).tolist() == [0, 0, 3, 3]
+    assert sum_splats(values.split(2), places, 4, [1])[0].squeeze(1).tolist() == [0, 0, 3, 3]
 
 
 def test_scatter_errors_name_the_value():
@@ -234,10 +235,12 @@ def test_scatter_errors_name_the_value():
     refused(RuntimeError, "group_.* 1 to 63 .*, got 64", scatter_splats, [torch.zeros(4)], masks, [0] * 64)
     with pytest.raises(RuntimeError, match=r"packed must have shape \[4\], got \[3\]"):
         gather_splats(torch.zeros(3, dtype=torch.int32), [torch.zeros(1, 2)], [1, 1])
-    with pytest.raises(RuntimeError, match=r"values must have shape \[3, 1\], got \[2, 1\]"):
-        sum_splats(torch.zeros(2, 1), torch.zeros(1, 2, dtype=torch.int64), [1, 2], 4, [1])
-    with pytest.raises(RuntimeError, match=r"places must have shape \[1, 2\], got \[1, 3\]"):
-        sum_splats(torch.zeros(3, 1), torch.zeros(1, 3, dtype=torch.int64), [1, 2], 4, [1])
+    places = torch.zeros(1, 2, dtype=torch.int64)
+    with pytest.raises(RuntimeError, match=r"values of a rank must have shape \[\*, 2\], got \[2, 1\]"):
+        sum_splats([torch.zeros(2, 1), torch.zeros(2, 2)], places, 4, [1, 1])
+    with pytest.raises(RuntimeError, match=r"places must have shape \[1, 1\], got \[1, 2\]"):
+        sum_splats([torch.zeros(3, 1)], places, 4, [1])
+    refused(RuntimeError, "values must have 1 to 63 entries, got 0", sum_splats, [], places, 4, [1])
 
 
 def test_scatter_opcheck():
@@ -246,7 +249,7 @@ def test_scatter_opcheck():
     torch.library.opcheck(ops.scatter_splats, (words, masks, [1, 2]))
     packed, places = ops.scatter_splats(words, masks, [1, 2])
     torch.library.opcheck(ops.gather_splats, (packed, [2, 1], [1, 2]))
-    torch.library.opcheck(ops.sum_splats, (torch.randn(3, 3), places, [1, 2], 3, [2, 1]))
+    torch.library.opcheck(ops.sum_splats, (torch.randn(3, 3).split([1, 2]), places, 3, [2, 1]))
 
 
 find_non_finite = torch.ops.blitzgs.find_non_finite

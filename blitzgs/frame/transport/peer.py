@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes splats into the memory of the GPUs that composite them, and lets their owners read gradients there.
+"""Writes splats into the memory of the GPUs that composite them; their owners read the gradients there.
 
 Each rank has a buffer (`SharedMemory.buffers`) that all ranks have mapped. The buffer has two parts: the
 columns of the splats that arrive at this rank, and the table in which compositing's backward pass adds up
@@ -16,7 +16,7 @@ In stream order, a step on every rank consists of
 - sorting, and compositing, which zeroes the rank's table;
 - the gradient of compositing, which is added up in this table;
 - barrier C;
-- reading the tables of all ranks.
+- summing this rank's rows of the tables of all ranks, which moves each gradient across a link once.
 
 Work that a rank queues after a barrier begins when all work that any rank queued before it has ended. Hence
 
@@ -187,7 +187,7 @@ class PeerTransport:
 
 @dataclass(frozen=True)
 class PeerWayBack(WayBack):
-    """Lets owners read gradients in the memory of the ranks that added them up."""
+    """Sums gradients that lie in the memory of the ranks that composited the splats."""
 
     memory: SharedMemory  # the memory that the ranks share
     generation: int  # number of the frame, `SharedMemory.generation`
@@ -207,7 +207,9 @@ class PeerWayBack(WayBack):
         return self.tables[self.ranks.rank][: sum(self.traffic.received)].zero_()
 
     def return_gradients(self, gradients: SplatGradients) -> SplatGradients:
-        """See `WayBack.return_gradients`; the result refers to the tables, in which the owner reads."""
+        """See `WayBack.return_gradients`."""
         self.memory.barrier()  # C
         mine = zip(self.tables, self.traffic.starts, self.traffic.sent, strict=True)
-        return SplatGradients([table[start : start + n] for table, start, n in mine], self.places)
+        rows = [table[start : start + n] for table, start, n in mine]
+        splats = self.traffic.own.splats
+        return SplatGradients(torch.ops.blitzgs.sum_splats(rows, self.places, splats, [SPLAT_GRADIENT]))

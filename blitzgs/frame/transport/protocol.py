@@ -167,7 +167,7 @@ class WayBack:
         """
         columns, traffic = gradients.side_by_side(), self.traffic
         returned = self.ranks.all_to_all(columns, traffic.received, traffic.sent)
-        return gradients.sum_returned(returned, self.places, traffic.sent, traffic.own.splats)
+        return gradients.sum_returned(returned.split(traffic.sent), self.places, traffic.own.splats)
 
     def return_sums(self, sums: Tensor) -> Tensor:
         """Return integer sums over the tiles of each rank to the splats' owners, and add them up. Collective.
@@ -184,7 +184,7 @@ class WayBack:
             if group.shape[0] == 0:
                 continue
             # The splats of a run are consecutive. `runs` has the position of the first one, and bits that
-            # tell which splats of the run were sent (csrc/exchange/places.h).
+            # tell which splats of the run were sent (csrc/exchange/scatter.h).
             here = runs[:, None] >> (32 + lanes) & 1
             at = (runs[:, None] & 0xFFFFFFFF) + here.cumsum(1) - here
             # Splats that were not sent take any row, times zero: leaving them out would need their number,
