@@ -11,9 +11,8 @@ several times with tiles divided by their measured cost.
 
 Stages: a barrier precedes every step, so that all ranks start it together. The time of a stage is the time
 between its marks on the device, of the slowest rank, as a median over batches and visits. "alone" is the sum
-of all stages. If ranks share memory, splats are sent in "project" and "sort", and the kernel of "optimiser"
-reads the gradients from the other ranks; "exchange" and "exchange back" are then the barriers before these
-reads.
+of all stages. If ranks share memory, splats are sent in "project"; "exchange back" then sums the gradients
+that lie with other ranks.
 
 Step: all batches run one after the other without a barrier, as in training. The time is that from the
 first to the last by the host's clock, divided by their number, as a median over the visits.
