@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measures a training step on several ranks: time by stage, bytes exchanged, balance.
 
-    python benchmarks/bm_exchange.py --data DIR [--downscale 2] [--device cuda] [--ranks 1 2 4] [--batch 4]
+    python benchmarks/bm_exchange.py --data DIR [--downscale 2] [--device cuda] [--ranks 1 2 4] [--batch 4 16]
     python benchmarks/bm_exchange.py --gaussians 16000000 --device cuda [--ranks 1 2 4]
 
 With --data the Gaussians are the octree of the capture's points, seen from evenly spaced training views;
@@ -21,6 +21,7 @@ first to the last by the host's clock, divided by their number, as a median over
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import statistics
@@ -195,6 +196,7 @@ def measure(args: argparse.Namespace) -> None:
                 )
         splats, visible, sent = (x / len(times) for x in ranks.all_reduce(totals).tolist())
         report = {
+            "views": args.batch,
             "ranks": ranks.world_size,
             "device": torch.cuda.get_device_name() if ranks.device.type == "cuda" else "cpu",
             "gaussians": load.total,
@@ -223,7 +225,7 @@ def main() -> None:
         help="as in `lod`; 0 where every camera sees a small part of the capture (%(default)s)",
     )
     parser.add_argument("--gaussians", type=int, default=1_000_000, help="of the aerial scene (%(default)s)")
-    parser.add_argument("--batch", type=int, default=4, help="views per step (%(default)s)")
+    parser.add_argument("--batch", type=int, nargs="+", default=[4], help="views per step (%(default)s)")
     parser.add_argument("--batches", type=int, default=6, help="different batches (%(default)s)")
     parser.add_argument("--visits", type=int, default=3, help="timed visits of every batch (%(default)s)")
     parser.add_argument(
@@ -235,11 +237,12 @@ def main() -> None:
     parser.add_argument("--ranks", type=int, nargs="+", default=[1, 2, 4])
     args = parser.parse_args()
     if "WORLD_SIZE" in os.environ:
+        [args.batch] = args.batch
         measure(args)
         return
     reports = []
-    for count in args.ranks:
-        command = [sys.executable, *torchrun(count), *sys.argv]
+    for batch, count in itertools.product(args.batch, args.ranks):
+        command = [sys.executable, *torchrun(count), *sys.argv, "--batch", str(batch)]
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
         line = next(text for text in done.stdout.splitlines() if text.startswith("REPORT "))
         reports.append(json.loads(line.removeprefix("REPORT ")))
