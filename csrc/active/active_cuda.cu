@@ -164,10 +164,8 @@ void rows_of_sectors(const CullMask& mask, CudaStream stream) { transpose<false>
 void gate_views(const ViewGateArgs& args, CudaStream stream) {
   if (args.capacity == 0) return;
   // The grid is limited because the list's capacity is the whole table and its valid entries are few.
-  const std::int64_t most = kResident * multiprocessors();
-  const auto blocks =
-      static_cast<unsigned>(std::min<std::int64_t>(blocks_for(args.capacity, kThreads), most));
-  launch_early("gate_views", gate_views_kernel, {blocks, kThreads, stream}, args);
+  launch_early("gate_views", gate_views_kernel,
+               {resident_blocks(args.capacity, kThreads, kResident), kThreads, stream}, args);
 }
 
 }  // namespace blitzgs::cuda

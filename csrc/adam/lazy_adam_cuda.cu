@@ -203,12 +203,6 @@ int rows_per_block(const AdamArgs<float>& args) {
   return args.columns[4].width == kFewPacks ? kMoreRows : kRows;
 }
 
-// The number of blocks for `items` items, at most as many as the device runs at a time.
-unsigned filled_blocks(std::int64_t items, int items_per_block, int blocks_per_multiprocessor) {
-  return std::min(blocks_for(items, items_per_block),
-                  static_cast<unsigned>(blocks_per_multiprocessor * multiprocessors()));
-}
-
 // Computes the rules by which rows catch up to args.step, which is not 0.
 Prepared prepare_rules(const AdamArgs<float>& args, Workspace& workspace, CudaStream stream) {
   // Rows whose moments are explicit_steps or more before last_step do not move (adam_moves), so longer decays
@@ -233,12 +227,12 @@ void catch_up(const AdamArgs<float>& args, Workspace& workspace, CudaStream stre
   auto* pending_rows = workspace.allocate<PendingRow>(args.n);
   // The grid is limited because n may be far more than the number of valid ids.
   launch_early("lazy_adam catch-up", list_pending_rows,
-               {filled_blocks(args.n, kListThreads, kListBlocks), kListThreads, stream}, args, prepared,
+               {resident_blocks(args.n, kListThreads, kListBlocks), kListThreads, stream}, args, prepared,
                pending_rows);
   const auto kernel = select(args, catch_up_kernel<4, 12, kRows>, catch_up_kernel<1, kFewPacks, kMoreRows>,
                              catch_up_kernel<1, 0, kRows>);
   launch_early("lazy_adam catch-up", kernel,
-               {filled_blocks(args.n, rows_per_block(args), kCatchUpBlocks), kThreads, stream}, args,
+               {resident_blocks(args.n, rows_per_block(args), kCatchUpBlocks), kThreads, stream}, args,
                prepared, pending_rows);
 }
 
@@ -272,7 +266,7 @@ void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream)
     const Prepared prepared = catches_up ? prepare_rules(behind, workspace, stream) : Prepared{};
     launch_early(
         "lazy_adam of one parameter", alone_kernel,
-        {filled_blocks(std::max<std::int64_t>(args.n, 1), block_rows, kListBlocks), kListThreads, stream},
+        {resident_blocks(std::max<std::int64_t>(args.n, 1), block_rows, kListBlocks), kListThreads, stream},
         args, prepared, block_rows);
     return;
   }

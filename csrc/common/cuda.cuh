@@ -3,6 +3,7 @@
 // does not include torch.
 #pragma once
 #include <cuda_runtime.h>
+#include <algorithm>
 #include <array>
 #include <atomic>
 #include <cstdint>
@@ -57,6 +58,35 @@ inline int multiprocessors() {
   check(cudaGetDevice(&device), "multiprocessors");
   check(cudaDeviceGetAttribute(&count, cudaDevAttrMultiProcessorCount, device), "multiprocessors");
   return count;
+}
+
+// The number of blocks for n items of a kernel that loops over them: at most `resident` for each
+// multiprocessor.
+inline unsigned resident_blocks(std::int64_t n, int threads, int resident) {
+  return static_cast<unsigned>(
+      std::min((n + threads - 1) / threads, std::int64_t{resident} * multiprocessors()));
+}
+
+// Waits for a value in device memory.
+template <class T>
+T read_back(const char* what, const T* value, CudaStream stream) {
+  T found{};
+  check(cudaMemcpyAsync(&found, value, sizeof(T), cudaMemcpyDeviceToHost, stream), what);
+  check(cudaStreamSynchronize(stream), what);
+  return found;
+}
+
+// Calls a function of CUB with scratch memory: run(null, bytes) first sets the bytes that it needs.
+template <class Run>
+void run_cub(const char* what, Workspace& workspace, const Run& run) {
+  std::size_t bytes = 0;
+  check(run(nullptr, bytes), what);
+  check(run(workspace.allocate_bytes(bytes), bytes), what);
+}
+
+__device__ __forceinline__ std::int64_t atomic_add(std::int64_t* sum, std::int64_t amount) {
+  return static_cast<std::int64_t>(
+      atomicAdd(reinterpret_cast<unsigned long long*>(sum), static_cast<unsigned long long>(amount)));
 }
 
 // Launches that avoid the gap of 1.2 to 2.5 us between two kernels of a stream (programmatic dependent

@@ -1,5 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
 
 #include <cub/cub.cuh>
 
@@ -100,7 +99,7 @@ __global__ void __launch_bounds__(kKeyThreads) key_histogram_kernel(const KeyHis
   }
   __syncthreads();
   for (int i = threadIdx.x; i < digits; i += kKeyThreads) {
-    if (counts[i] > 0) atomicAdd(reinterpret_cast<unsigned long long*>(args.counts + i), counts[i]);
+    if (counts[i] > 0) atomic_add(args.counts + i, counts[i]);
   }
 }
 
@@ -170,16 +169,10 @@ std::int32_t sort_along_curve(const float* points, std::int32_t n, std::int32_t*
   std::uint64_t* codes = workspace.allocate<std::uint64_t>(2 * std::int64_t{n});
   std::int32_t* rows = workspace.allocate<std::int32_t>(n);
   make_codes<<<blocks_for(n, 256), 256, 0, stream>>>(points, n, bounds, codes, rows);
-  std::size_t bytes = 0;
-  const auto sort = [&](void* scratch) {  // null: sets the bytes of scratch memory that it needs
+  run_cub("knn", workspace, [&](void* scratch, std::size_t& bytes) {
     return cub::DeviceRadixSort::SortPairs(scratch, bytes, codes, codes + n, rows, order, n, 0, 64, stream);
-  };
-  check(sort(nullptr), "knn");
-  check(sort(workspace.allocate_bytes(bytes)), "knn");
-  std::int32_t finite = 0;
-  check(cudaMemcpyAsync(&finite, &bounds->finite, sizeof(finite), cudaMemcpyDeviceToHost, stream), "knn");
-  check(cudaStreamSynchronize(stream), "knn");
-  return finite;
+  });
+  return read_back("knn", &bounds->finite, stream);
 }
 
 }  // namespace
@@ -225,9 +218,7 @@ void copy_rows(const CopyRows& copy, CudaStream stream) {
 void key_histogram(const KeyHistogram& args, CudaStream stream) {
   check(cudaMemsetAsync(args.counts, 0, sizeof(*args.counts) << args.width, stream), "key_histogram");
   if (args.n == 0) return;
-  const auto blocks =
-      std::min(blocks_for(args.n, kKeyThreads), static_cast<unsigned>(kResident * multiprocessors()));
-  key_histogram_kernel<<<blocks, kKeyThreads, 0, stream>>>(args);
+  key_histogram_kernel<<<resident_blocks(args.n, kKeyThreads, kResident), kKeyThreads, 0, stream>>>(args);
   check_launch("key_histogram");
 }
 

@@ -8,8 +8,6 @@
 #include "project/project_device.cuh"
 #include "project/unscented.h"
 
-#include <algorithm>
-
 namespace blitzgs::cuda {
 
 namespace {
@@ -195,20 +193,18 @@ void prefilter(const Inputs& in, const Prefiltered& kept, Workspace& workspace, 
     check(cudaMemsetAsync(kept.count, 0, sizeof(*kept.count), stream), "project");
     return;
   }
-  const std::int64_t blocks = std::min<std::int64_t>(turns, kBlocksPerMultiprocessor * multiprocessors());
-  auto* zeros = turn_zeros(turns, workspace, stream);
-  prefilter_kernel<<<static_cast<unsigned>(blocks), kPrefilterThreads, 0, stream>>>(in, kept,
-                                                                                    RunningSum(zeros));
+  prefilter_kernel<<<resident_blocks(turns, 1, kBlocksPerMultiprocessor), kPrefilterThreads, 0, stream>>>(
+      in, kept, RunningSum(turn_zeros(turns, workspace, stream)));
   check_launch("project");
 }
 
 void write_colors(const Inputs& in, const ProjectCapacity& capacity, const ProjectColumns<float>& columns,
                   CudaStream stream) {
   if (capacity.sizes.splats == 0 || !in.sh) return;
-  const std::int64_t blocks = (capacity.sizes.splats + kSplatsOfBlock - 1) / kSplatsOfBlock;
+  const unsigned blocks = blocks_for(capacity.sizes.splats, kSplatsOfBlock);
   dispatch_sh(in, [&](auto degree, auto quads) {
-    color_kernel<degree.value, quads.value><<<static_cast<unsigned>(blocks), kColorThreads, 0, stream>>>(
-        in, columns.ids, capacity, columns.values);
+    color_kernel<degree.value, quads.value>
+        <<<blocks, kColorThreads, 0, stream>>>(in, columns.ids, capacity, columns.values);
   });
   check_launch("project");
 }
