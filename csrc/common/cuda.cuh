@@ -196,6 +196,21 @@ __device__ __forceinline__ T sum_of_lanes_until(T value, int lane) {
   return value;
 }
 
+// Transposes the 32 x 32 bits of a warp: bit r of the result of lane c is bit c of the argument of lane r.
+__device__ __forceinline__ std::uint32_t transpose_bits(std::uint32_t bits, int lane) {
+  constexpr std::uint32_t kLow[5] = {0x55555555u, 0x33333333u, 0x0f0f0f0fu, 0x00ff00ffu, 0x0000ffffu};
+#pragma unroll
+  for (int i = 4; i >= 0; --i) {
+    const int step = 1 << i;
+    const bool high = lane & step;
+    const std::uint32_t other = __shfl_xor_sync(kFullWarp, bits, step);
+    const std::uint32_t keep = high ? ~kLow[i] : kLow[i];
+    const std::uint32_t moved = __funnelshift_l(other, other, high ? 32 - step : step);
+    bits = (bits & keep) | (moved & ~keep);
+  }
+  return bits;
+}
+
 // Returns the sum of `value` over a block of THREADS threads on thread 0, and 0 on the others.
 template <int THREADS>
 __device__ double block_sum(double value) {
