@@ -180,11 +180,19 @@ BLITZGS_HD PendingSteps<T> pending_steps(const AdamArgs<T>& args, std::int32_t f
   return steps;
 }
 
-// The pending steps of a row that is behind by explicit_steps or more.
+// Row `from`: the pending steps of a row of the table at this step that is behind by explicit_steps or more.
+// Reads the table, explicit_steps and eps of args.
 template <class T>
-BLITZGS_HD PendingSteps<T> final_pending_steps(const AdamArgs<T>& args, std::int32_t from) {
-  return pending_steps(args, from, from + args.explicit_steps);
-}
+struct FinalRules {
+  AdamArgs<T> args;
+  PendingSteps<T>* rules;  // [n]
+  std::int64_t n;
+
+  BLITZGS_HD void operator()(std::int64_t i) const {
+    const auto from = static_cast<std::int32_t>(i);
+    rules[i] = pending_steps(args, from, from + args.explicit_steps);
+  }
+};
 
 // The drift of one element by its pending steps, one by one; m and root = sqrt(v) are those at step
 // steps.from.
@@ -308,10 +316,6 @@ namespace BLITZGS_BACKEND {
 // `step`.
 template <class T>
 void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream);
-// Computes the final rules [n] for rows at the steps 0 .. n - 1. Reads the table, explicit_steps and eps of
-// args.
-template <class T>
-void final_rules(const AdamArgs<T>& args, std::int64_t n, PendingSteps<T>* rules, CudaStream);
 }  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -27,14 +27,6 @@ constexpr int kFewPacks = 3, kMoreRows = kThreads / (kFewPacks + 8);
 constexpr int kCatchUpBlocks = 4, kListBlocks = 8;  // per multiprocessor
 constexpr int kAlone = kAdamColumns - 1;            // the column of a parameter that is stepped alone
 
-// rules [n]: the final rules of each step, one thread per step.
-__global__ void __launch_bounds__(kListThreads)
-    final_rules_kernel(const __grid_constant__ AdamArgs<float> args, std::int64_t n,
-                       PendingSteps<float>* rules) {
-  const std::int64_t from = blockIdx.x * std::int64_t{kListThreads} + threadIdx.x;
-  if (from < n) rules[from] = final_pending_steps(args, static_cast<std::int32_t>(from));
-}
-
 // Calls update<Column, Width>(local row, pack) for the packs that this thread handles in every Rows rows.
 // ShPacks: the packs in an SH row; 0: sh_packs is their number.
 template <int ShWidth, int ShPacks, int Rows, class F>
@@ -279,15 +271,8 @@ void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream)
   launch_early("lazy_adam step", kernel, {blocks_for(args.n, rows_per_block(args)), kThreads, stream}, args);
 }
 
-template <class T>
-void final_rules(const AdamArgs<T>& args, std::int64_t n, PendingSteps<T>* rules, CudaStream stream) {
-  if (n == 0) return;
-  final_rules_kernel<<<blocks_for(n, kListThreads), kListThreads, 0, stream>>>(args, n, rules);
-  check_launch("lazy_adam_final_rules");
-}
-
 template void lazy_adam<float>(const AdamArgs<float>&, Workspace&, CudaStream);
-template void final_rules<float>(const AdamArgs<float>&, std::int64_t, PendingSteps<float>*, CudaStream);
+template void for_each_row(const FinalRules<float>&, CudaStream);
 template void for_each_row(const PositionNoise<float>&, CudaStream);
 
 }  // namespace blitzgs::cuda

@@ -140,14 +140,6 @@ __global__ void gather_points(const float* points, const std::int32_t* order, st
   for (int axis = 0; axis < 3; ++axis) sorted[3 * i + axis] = points[3 * std::int64_t{order[i]} + axis];
 }
 
-// The boxes of one level of the tree, one thread per box.
-__global__ void make_boxes(const KnnTree<float> tree, int level, KnnBox<float>* boxes) {
-  const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
-  if (i < tree.count[level]) {
-    boxes[tree.offset[level] + i] = make_knn_box(tree, level, static_cast<std::int32_t>(i));
-  }
-}
-
 // distances [N, k], one thread per sorted point.
 template <int K>
 __global__ void __launch_bounds__(kQueryThreads)
@@ -207,6 +199,7 @@ template void for_each_row(const BracketKeys&, CudaStream);
 template void for_each_row(const MatchBrackets&, CudaStream);
 template void for_each_row(const SamplingKeys&, CudaStream);
 template void for_each_row(const KeysUpTo&, CudaStream);
+template void for_each_row(const KnnLevel<float>&, CudaStream);
 
 void copy_rows(const CopyRows& copy, CudaStream stream) {
   if (copy.n == 0 || copy.row_bytes == 0) return;
@@ -241,11 +234,7 @@ void knn_distances(const T* points, std::int32_t n, int k, T* distances, Workspa
   gather_points<<<blocks_for(tree.n, 256), 256, 0, stream>>>(points, order, tree.n, sorted);
   tree.points = sorted;
   tree.order = order;
-  KnnBox<float>* boxes = workspace.allocate<KnnBox<float>>(plan_knn_levels(tree.n, tree));
-  tree.boxes = boxes;
-  for (int level = 0; level < tree.levels; ++level) {
-    make_boxes<<<blocks_for(tree.count[level], 256), 256, 0, stream>>>(tree, level, boxes);
-  }
+  make_knn_boxes(tree, workspace, stream);
   with_knn_length(k, [&]<int K>() {
     query_kernel<K><<<blocks_for(tree.n, kQueryThreads), kQueryThreads, 0, stream>>>(tree, k, distances);
   });
