@@ -155,6 +155,13 @@ struct ProjectSizes {
 struct ProjectCapacity {
   ProjectSizes sizes;
   const std::int64_t* totals;
+
+  // The actual numbers, or zeros if they exceed the capacity. (CUDA: in a kernel.)
+  BLITZGS_HD ProjectSizes fitting() const {
+    if (!totals) return sizes;
+    const ProjectSizes actual{totals[kTotalVisible], totals[kTotalSplats]};
+    return actual.visible <= sizes.visible && actual.splats <= sizes.splats ? actual : ProjectSizes{0, 0};
+  }
 };
 
 // gaussian_ids [P] and camera_ids [P]: the Gaussian and the view of each splat. visible_ids [U]: the

@@ -165,7 +165,7 @@ __global__ void __launch_bounds__(kColorThreads, kColorBlocks)
   __shared__ TripleStage triples[kColorThreads / 32];
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   ShStage<DEGREE>& stage = stages[QUADS ? warp : 0];
-  const std::int64_t n_splats = fitting(capacity).splats, step = gridDim.x * std::int64_t{kSplatsOfBlock};
+  const std::int64_t n_splats = capacity.fitting().splats, step = gridDim.x * std::int64_t{kSplatsOfBlock};
   const std::int64_t block_start = blockIdx.x * std::int64_t{kSplatsOfBlock};
   if (block_start >= n_splats) return;
   load_cameras(in, cameras);

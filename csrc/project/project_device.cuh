@@ -265,16 +265,6 @@ __device__ inline std::int64_t candidates_of(const Inputs& in) {
   return in.n_active ? *in.n_active : in.n_candidates;
 }
 
-// The numbers of visible Gaussians and splats that write_splats wrote, or zeros if they exceeded the
-// capacity.
-__device__ inline ProjectSizes fitting(const ProjectCapacity& capacity) {
-  if (!capacity.totals) return capacity.sizes;
-  const ProjectSizes sizes{capacity.totals[kTotalVisible], capacity.totals[kTotalSplats]};
-  return sizes.visible <= capacity.sizes.visible && sizes.splats <= capacity.sizes.splats
-             ? sizes
-             : ProjectSizes{0, 0};
-}
-
 // The output of the prefilter: the Gaussians that some view may see, in the order of the candidates, and
 // these views as bits. count [1]; ids and views [candidates], of which the first *count entries are valid.
 struct Prefiltered {
