@@ -210,22 +210,21 @@ void write_colors(const Inputs& in, const ProjectCapacity& capacity, const Proje
 }
 
 template <>
-void project<float>(const Inputs& in, const RankTiles& rank_tiles, SplatMemory<float>& memory,
-                    std::int64_t* totals, Workspace& workspace, CudaStream stream) {
+void project<float>(const Inputs& in, const RankTiles& rank_tiles, const ProjectSizes* capacity,
+                    const SplatMemory<float>& memory, std::int64_t* totals, Workspace& workspace,
+                    CudaStream stream) {
   const Prefiltered kept(in.n_candidates, workspace);
   prefilter(in, kept, workspace, stream);
-  if (const ProjectSizes* capacity = memory.capacity()) {
-    const ProjectColumns<float> columns = memory.allocate(*capacity);
+  if (capacity) {
+    const ProjectColumns<float> columns = memory(*capacity);
     write_splats(in, rank_tiles, kept, *capacity, columns, totals, workspace, stream);
     write_colors(in, {*capacity, totals}, columns, stream);
     return;
   }
   write_splats(in, rank_tiles, kept, {0, 0}, {}, totals, workspace, stream);
-  std::int64_t counted[kTotalSplats + 1];
-  check(cudaMemcpyAsync(counted, totals, sizeof(counted), cudaMemcpyDeviceToHost, stream), "project");
-  check(cudaStreamSynchronize(stream), "project");
-  const ProjectSizes sizes{counted[kTotalVisible], counted[kTotalSplats]};
-  const ProjectColumns<float> columns = memory.allocate(sizes);
+  static_assert(kTotalVisible == 0 && kTotalSplats == 1);
+  const auto sizes = read_back("project", reinterpret_cast<const ProjectSizes*>(totals), stream);
+  const ProjectColumns<float> columns = memory(sizes);
   write_splats(in, rank_tiles, kept, sizes, columns, nullptr, workspace, stream);
   write_colors(in, {sizes, nullptr}, columns, stream);
 }
