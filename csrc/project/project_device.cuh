@@ -126,12 +126,6 @@ struct ShRow {
   }
 };
 
-// Whether rows of `stride` floats at `sh` can be read and written 16 bytes at a time.
-template <int DEGREE>
-bool quads_fit(const float* sh, int stride) {
-  return ShRow<DEGREE>::kWhole && sh && stride % 4 == 0 && aligned16(sh);
-}
-
 // Shared memory for the 32 SH rows of a warp. In each load or store the lanes move consecutive 16-byte pieces
 // of two or three rows. One lane per row would touch 32 cache lines at a time.
 template <int DEGREE>
@@ -204,7 +198,7 @@ struct ShStage {
 template <class F>
 void dispatch_sh(const Inputs& in, const F& f) {
   const auto with_degree = [&](auto degree) {
-    if (quads_fit<degree.value>(in.sh, 3 * in.options.sh_stride)) {
+    if (in.sh && 3 * in.options.sh_stride % 4 == 0 && aligned16(in.sh)) {
       f(degree, std::bool_constant<ShRow<degree.value>::kWhole>{});
     } else {
       f(degree, std::false_type{});
