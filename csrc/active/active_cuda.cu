@@ -71,19 +71,6 @@ __global__ void __launch_bounds__(kThreads) move_blocks(const SwapBlocks swap, i
   }
 }
 
-// The view gate (view_gate.h).
-
-// Transposes the 32 x 32 bits of a warp: bit i of the result of lane l is bit l of the argument of lane i.
-__device__ std::uint32_t transpose_bits(std::uint32_t word, int lane) {
-  std::uint32_t own = 0;
-#pragma unroll
-  for (int bit = 0; bit < 32; ++bit) {
-    const std::uint32_t lanes_with_bit = __ballot_sync(kFullWarp, word >> bit & 1u);
-    if (lane == bit) own = lanes_with_bit;
-  }
-  return own;
-}
-
 // Converts a mask by rows to sectors or back (view_gate.h). A CUDA block handles a block of 256 rows; each of
 // its warps handles 32 of these rows, which are one word of each sector.
 template <bool kToSectors>
@@ -164,10 +151,8 @@ void rows_of_sectors(const CullMask& mask, CudaStream stream) { transpose<false>
 void gate_views(const ViewGateArgs& args, CudaStream stream) {
   if (args.capacity == 0) return;
   // The grid is limited because the list's capacity is the whole table and its valid entries are few.
-  const std::int64_t most = kResident * multiprocessors();
-  const auto blocks =
-      static_cast<unsigned>(std::min<std::int64_t>(blocks_for(args.capacity, kThreads), most));
-  launch_early("gate_views", gate_views_kernel, {blocks, kThreads, stream}, args);
+  launch_early("gate_views", gate_views_kernel,
+               {resident_blocks(args.capacity, kThreads, kResident), kThreads, stream}, args);
 }
 
 }  // namespace blitzgs::cuda

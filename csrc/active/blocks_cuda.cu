@@ -1,5 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
 
 #include "active/blocks.h"
 #include "active/view_gate.h"
@@ -216,11 +215,6 @@ __global__ void __launch_bounds__(kBlockRows)
   }
 }
 
-// The number of CUDA blocks for a kernel that handles `blocks` blocks of the table in a loop.
-unsigned persistent_blocks(std::int64_t blocks) {
-  return static_cast<unsigned>(std::min<std::int64_t>(blocks, kResident * multiprocessors()));
-}
-
 // Finds the blocks that some view may see. If the capacity is not 0, also lists their active rows.
 void cull(const CullInputs& in, const ActiveList& out, Workspace& workspace, CudaStream stream) {
   const CullPlan plan(out.capacity_blocks, workspace);
@@ -237,8 +231,8 @@ void cull(const CullInputs& in, const ActiveList& out, Workspace& workspace, Cud
                plan, counters, mixed, out.n_blocks, planes);
   if (out.capacity_blocks == 0) return;
   launch_early("cull_blocks", gated ? test_rows<true> : test_rows<false>,
-               {persistent_blocks(out.capacity_blocks), kBlockRows, stream}, in, plan, counters, mixed,
-               out.n_blocks, planes);
+               {resident_blocks(out.capacity_blocks, 1, kResident), kBlockRows, stream}, in, plan, counters,
+               mixed, out.n_blocks, planes);
   launch_early("cull_blocks", emit_rows, {blocks_for(out.capacity_blocks, kWarps), kBlockRows, stream},
                in.rows.n, plan, groups, out);
 }
@@ -264,18 +258,15 @@ void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::in
     launch_early("update_block_bounds", list_blocks, {blocks_for(n_ids, 256), 256, stream}, ids, n_ids, list,
                  length);
   }
-  launch_early("update_block_bounds", update_bounds, {persistent_blocks(blocks), kBlockRows, stream}, rows,
-               list, length, bounds);
+  launch_early("update_block_bounds", update_bounds,
+               {resident_blocks(blocks, 1, kResident), kBlockRows, stream}, rows, list, length, bounds);
 }
 
 std::int64_t count_active_blocks(const CullInputs& in, Workspace& workspace, CudaStream stream) {
   if (in.rows.n == 0) return 0;
   auto* n_blocks = workspace.allocate<std::int32_t>(1);
   cull(in, {nullptr, nullptr, nullptr, n_blocks, 0}, workspace, stream);
-  std::int32_t count = 0;
-  check(cudaMemcpyAsync(&count, n_blocks, sizeof(count), cudaMemcpyDeviceToHost, stream), "cull_blocks");
-  check(cudaStreamSynchronize(stream), "cull_blocks");
-  return count;
+  return read_back("cull_blocks", n_blocks, stream);
 }
 
 void cull_blocks(const CullInputs& in, const ActiveList& out, Workspace& workspace, CudaStream stream) {

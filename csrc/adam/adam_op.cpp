@@ -51,7 +51,8 @@ Tensor lazy_adam_final_rules(const Tensor& table, const Tensor& like, std::int64
     args.explicit_steps = static_cast<std::int32_t>(explicit_steps);
     args.eps = eps;
     const auto rules = make<std::uint8_t>(values, {n, sizeof(PendingSteps<T>)});
-    backend::final_rules(args, n, reinterpret_cast<PendingSteps<T>*>(rules.data()), scope.stream);
+    backend::for_each_row(FinalRules<T>{args, reinterpret_cast<PendingSteps<T>*>(rules.data()), n},
+                          scope.stream);
     return rules;
   });
 }

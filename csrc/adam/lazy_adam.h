@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// The lazy optimiser: dense Adam over a list of rows. A row that had no gradient for k steps has k pending
-// steps. It catches up (takes its pending steps) when it is needed next, in time that does not depend on k.
-//
-// Dense Adam (Kingma & Ba 2015), step t with gradient g:
+// The lazy optimiser: dense Adam (Kingma & Ba 2015) over a list of rows. A row that had no gradient for k
+// steps has k pending steps. It catches up (takes its pending steps) when it is needed next, in time that
+// does not depend on k. Step t with gradient g:
 //   m = beta1 m + (1 - beta1) g,   v = beta2 v + (1 - beta2) g^2,
 //   p -= lr_t b_t m / (a_t sqrt(v) + eps),   b_t = 1 / (1 - beta1^t),   a_t = 1 / sqrt(1 - beta2^t).
 //
@@ -36,11 +35,12 @@
 #include <cstdint>
 
 #include "common/kernel.h"
+#include "math/vec.h"
 
 // Columns of the table of a learning-rate schedule, double [S + 1, 30], made once in Python
-// (blitzgs/ops/lazy_adam.py). S is the last step; row t holds, with
-//   a_t = 1 / sqrt(1 - beta2^t),  b_t = 1 / (1 - beta1^t)  (row 0: 0)  and  q_k = beta1 beta2^((k - 1) / 2),
-// for the groups g = means, quats, scales, opacities, SH DC, SH rest and the orders k = 0 .. 3
+// (blitzgs/ops/lazy_adam.py). S is the last step; row t holds, with q_k = beta1 beta2^((k - 1) / 2) and a_t
+// and b_t as above (row 0: 0), for the groups g = means, quats, scales, opacities, SH DC, SH rest and the
+// orders k = 0 .. 3
 //   tail_k[t] = sum over u = t + 1 .. S of lr_u b_u a_u^(k - 1) q_k^(u - t).
 
 namespace blitzgs {
@@ -180,11 +180,19 @@ BLITZGS_HD PendingSteps<T> pending_steps(const AdamArgs<T>& args, std::int32_t f
   return steps;
 }
 
-// The pending steps of a row that is behind by explicit_steps or more.
+// Row `from`: the pending steps of a row of the table at this step that is behind by explicit_steps or more.
+// Reads the table, explicit_steps and eps of args.
 template <class T>
-BLITZGS_HD PendingSteps<T> final_pending_steps(const AdamArgs<T>& args, std::int32_t from) {
-  return pending_steps(args, from, from + args.explicit_steps);
-}
+struct FinalRules {
+  AdamArgs<T> args;
+  PendingSteps<T>* rules;  // [n]
+  std::int64_t n;
+
+  BLITZGS_HD void operator()(std::int64_t i) const {
+    const auto from = static_cast<std::int32_t>(i);
+    rules[i] = pending_steps(args, from, from + args.explicit_steps);
+  }
+};
 
 // The drift of one element by its pending steps, one by one; m and root = sqrt(v) are those at step
 // steps.from.
@@ -206,9 +214,8 @@ BLITZGS_HD T adam_explicit_drift(const AdamArgs<T>& args, const PendingSteps<T>&
   return drift;
 }
 
-// The square root, and the reciprocal of a number that is zero or normal. On CUDA they are exact to an ulp.
-// Correct rounding would take most of an update's instructions, and the ulp is below the update's own
-// rounding.
+// The square root. On CUDA it is exact to an ulp, as the reciprocal: correct rounding would take most of an
+// update's instructions, and the ulp is below the update's own rounding.
 template <class T>
 BLITZGS_HD T adam_root(T x) {
 #ifdef __CUDA_ARCH__
@@ -220,22 +227,11 @@ BLITZGS_HD T adam_root(T x) {
   return std::sqrt(x);
 }
 
-template <class T>
-BLITZGS_HD T adam_reciprocal(T x) {
-#ifdef __CUDA_ARCH__
-  if constexpr (sizeof(T) == 4) {
-    asm("rcp.approx.ftz.f32 %0, %0;" : "+f"(x));
-    return x;
-  }
-#endif
-  return T(1) / x;
-}
-
 // The drift of one element by its group's rule; m and root = sqrt(v) are those at the rule's first step.
 template <class T>
 BLITZGS_HD T adam_ruled_drift(const AdamRule<T>& rule, T m, T root, T eps) {
-  const T drift = m * (adam_reciprocal(rule.place[0] * root + eps) * rule.weight[0] +
-                       adam_reciprocal(rule.place[1] * root + eps) * rule.weight[1]);
+  const T drift = m * (reciprocal(rule.place[0] * root + eps) * rule.weight[0] +
+                       reciprocal(rule.place[1] * root + eps) * rule.weight[1]);
   return m == 0 ? T(0) : drift;
 }
 
@@ -285,7 +281,7 @@ template <class T>
 BLITZGS_HD void adam_update(const AdamStep<T>& s, int group, T g, T& p, T& m, T& v) {
   m = s.beta1 * m + s.one_minus_beta1 * g;
   v = s.beta2 * v + s.one_minus_beta2 * (g * g);
-  p -= s.rate[group] * m * adam_reciprocal(adam_root(v) * s.inverse_root2 + s.eps);
+  p -= s.rate[group] * m * reciprocal(adam_root(v) * s.inverse_root2 + s.eps);
 }
 
 // The learning-rate group of element j of a column; groups ascend within a column and over the columns.
@@ -320,10 +316,6 @@ namespace BLITZGS_BACKEND {
 // `step`.
 template <class T>
 void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream);
-// Computes the final rules [n] for rows at the steps 0 .. n - 1. Reads the table, explicit_steps and eps of
-// args.
-template <class T>
-void final_rules(const AdamArgs<T>& args, std::int64_t n, PendingSteps<T>* rules, CudaStream);
 }  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

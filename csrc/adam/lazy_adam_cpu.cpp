@@ -89,15 +89,6 @@ void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream) {
   }
 }
 
-template <class T>
-void final_rules(const AdamArgs<T>& args, std::int64_t n, PendingSteps<T>* rules, CudaStream) {
-  parallel_rows(n, 1024, [&](std::int64_t from) {
-    rules[from] = final_pending_steps(args, static_cast<std::int32_t>(from));
-  });
-}
-
-template void final_rules<float>(const AdamArgs<float>&, std::int64_t, PendingSteps<float>*, CudaStream);
-template void final_rules<double>(const AdamArgs<double>&, std::int64_t, PendingSteps<double>*, CudaStream);
 template void lazy_adam<float>(const AdamArgs<float>&, Workspace&, CudaStream);
 template void lazy_adam<double>(const AdamArgs<double>&, Workspace&, CudaStream);
 

@@ -27,14 +27,6 @@ constexpr int kFewPacks = 3, kMoreRows = kThreads / (kFewPacks + 8);
 constexpr int kCatchUpBlocks = 4, kListBlocks = 8;  // per multiprocessor
 constexpr int kAlone = kAdamColumns - 1;            // the column of a parameter that is stepped alone
 
-// rules [n]: the final rules of each step, one thread per step.
-__global__ void __launch_bounds__(kListThreads)
-    final_rules_kernel(const __grid_constant__ AdamArgs<float> args, std::int64_t n,
-                       PendingSteps<float>* rules) {
-  const std::int64_t from = blockIdx.x * std::int64_t{kListThreads} + threadIdx.x;
-  if (from < n) rules[from] = final_pending_steps(args, static_cast<std::int32_t>(from));
-}
-
 // Calls update<Column, Width>(local row, pack) for the packs that this thread handles in every Rows rows.
 // ShPacks: the packs in an SH row; 0: sh_packs is their number.
 template <int ShWidth, int ShPacks, int Rows, class F>
@@ -203,12 +195,6 @@ int rows_per_block(const AdamArgs<float>& args) {
   return args.columns[4].width == kFewPacks ? kMoreRows : kRows;
 }
 
-// The number of blocks for `items` items, at most as many as the device runs at a time.
-unsigned filled_blocks(std::int64_t items, int items_per_block, int blocks_per_multiprocessor) {
-  return std::min(blocks_for(items, items_per_block),
-                  static_cast<unsigned>(blocks_per_multiprocessor * multiprocessors()));
-}
-
 // Computes the rules by which rows catch up to args.step, which is not 0.
 Prepared prepare_rules(const AdamArgs<float>& args, Workspace& workspace, CudaStream stream) {
   // Rows whose moments are explicit_steps or more before last_step do not move (adam_moves), so longer decays
@@ -233,12 +219,12 @@ void catch_up(const AdamArgs<float>& args, Workspace& workspace, CudaStream stre
   auto* pending_rows = workspace.allocate<PendingRow>(args.n);
   // The grid is limited because n may be far more than the number of valid ids.
   launch_early("lazy_adam catch-up", list_pending_rows,
-               {filled_blocks(args.n, kListThreads, kListBlocks), kListThreads, stream}, args, prepared,
+               {resident_blocks(args.n, kListThreads, kListBlocks), kListThreads, stream}, args, prepared,
                pending_rows);
   const auto kernel = select(args, catch_up_kernel<4, 12, kRows>, catch_up_kernel<1, kFewPacks, kMoreRows>,
                              catch_up_kernel<1, 0, kRows>);
   launch_early("lazy_adam catch-up", kernel,
-               {filled_blocks(args.n, rows_per_block(args), kCatchUpBlocks), kThreads, stream}, args,
+               {resident_blocks(args.n, rows_per_block(args), kCatchUpBlocks), kThreads, stream}, args,
                prepared, pending_rows);
 }
 
@@ -272,7 +258,7 @@ void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream)
     const Prepared prepared = catches_up ? prepare_rules(behind, workspace, stream) : Prepared{};
     launch_early(
         "lazy_adam of one parameter", alone_kernel,
-        {filled_blocks(std::max<std::int64_t>(args.n, 1), block_rows, kListBlocks), kListThreads, stream},
+        {resident_blocks(std::max<std::int64_t>(args.n, 1), block_rows, kListBlocks), kListThreads, stream},
         args, prepared, block_rows);
     return;
   }
@@ -285,15 +271,8 @@ void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream)
   launch_early("lazy_adam step", kernel, {blocks_for(args.n, rows_per_block(args)), kThreads, stream}, args);
 }
 
-template <class T>
-void final_rules(const AdamArgs<T>& args, std::int64_t n, PendingSteps<T>* rules, CudaStream stream) {
-  if (n == 0) return;
-  final_rules_kernel<<<blocks_for(n, kListThreads), kListThreads, 0, stream>>>(args, n, rules);
-  check_launch("lazy_adam_final_rules");
-}
-
 template void lazy_adam<float>(const AdamArgs<float>&, Workspace&, CudaStream);
-template void final_rules<float>(const AdamArgs<float>&, std::int64_t, PendingSteps<float>*, CudaStream);
+template void for_each_row(const FinalRules<float>&, CudaStream);
 template void for_each_row(const PositionNoise<float>&, CudaStream);
 
 }  // namespace blitzgs::cuda

@@ -3,6 +3,7 @@
 // does not include torch.
 #pragma once
 #include <cuda_runtime.h>
+#include <algorithm>
 #include <array>
 #include <atomic>
 #include <cstdint>
@@ -57,6 +58,35 @@ inline int multiprocessors() {
   check(cudaGetDevice(&device), "multiprocessors");
   check(cudaDeviceGetAttribute(&count, cudaDevAttrMultiProcessorCount, device), "multiprocessors");
   return count;
+}
+
+// The number of blocks for n items of a kernel that loops over them: at most `resident` for each
+// multiprocessor.
+inline unsigned resident_blocks(std::int64_t n, int threads, int resident) {
+  return static_cast<unsigned>(
+      std::min((n + threads - 1) / threads, std::int64_t{resident} * multiprocessors()));
+}
+
+// Waits for a value in device memory.
+template <class T>
+T read_back(const char* what, const T* value, CudaStream stream) {
+  T found{};
+  check(cudaMemcpyAsync(&found, value, sizeof(T), cudaMemcpyDeviceToHost, stream), what);
+  check(cudaStreamSynchronize(stream), what);
+  return found;
+}
+
+// Calls a function of CUB with scratch memory: run(null, bytes) first sets the bytes that it needs.
+template <class Run>
+void run_cub(const char* what, Workspace& workspace, const Run& run) {
+  std::size_t bytes = 0;
+  check(run(nullptr, bytes), what);
+  check(run(workspace.allocate_bytes(bytes), bytes), what);
+}
+
+__device__ __forceinline__ std::int64_t atomic_add(std::int64_t* sum, std::int64_t amount) {
+  return static_cast<std::int64_t>(
+      atomicAdd(reinterpret_cast<unsigned long long*>(sum), static_cast<unsigned long long>(amount)));
 }
 
 // Launches that avoid the gap of 1.2 to 2.5 us between two kernels of a stream (programmatic dependent
@@ -166,6 +196,21 @@ __device__ __forceinline__ T sum_of_lanes_until(T value, int lane) {
   return value;
 }
 
+// Transposes the 32 x 32 bits of a warp: bit r of the result of lane c is bit c of the argument of lane r.
+__device__ __forceinline__ std::uint32_t transpose_bits(std::uint32_t bits, int lane) {
+  constexpr std::uint32_t kLow[5] = {0x55555555u, 0x33333333u, 0x0f0f0f0fu, 0x00ff00ffu, 0x0000ffffu};
+#pragma unroll
+  for (int i = 4; i >= 0; --i) {
+    const int step = 1 << i;
+    const bool high = lane & step;
+    const std::uint32_t other = __shfl_xor_sync(kFullWarp, bits, step);
+    const std::uint32_t keep = high ? ~kLow[i] : kLow[i];
+    const std::uint32_t moved = __funnelshift_l(other, other, high ? 32 - step : step);
+    bits = (bits & keep) | (moved & ~keep);
+  }
+  return bits;
+}
+
 // Returns the sum of `value` over a block of THREADS threads on thread 0, and 0 on the others.
 template <int THREADS>
 __device__ double block_sum(double value) {
@@ -181,22 +226,50 @@ __device__ double block_sum(double value) {
   return total;
 }
 
-// A prefix sum over the blocks of a launch while they run, without a second launch (decoupled look-back,
-// Merrill & Garland 2016). Each block has a sum in [0, 2^62) and gets the sum over all blocks before it. A
-// block first publishes its own sum. It then adds up the sums of its predecessors, from the nearest to the
-// farthest, until it finds a predecessor that has published the sum up to and including itself. At last the
-// block publishes its own such sum. Blocks are numbered in the order in which they start, so all predecessors
-// of a waiting block run or have run.
-class RunningSum {
+// The memory of a prefix sum over the blocks of a launch while they run: a counter from which blocks take
+// numbers, and a state for each number. The two high bits of a state say what the rest is: the own sum of
+// that number, or what the sum's class says. Kind and sum are in one word, so no fence is needed to order
+// them. Sums are in [0, 2^62).
+class SumStates {
  public:
-  // zeros: one word for each block and one more, all zero.
-  explicit RunningSum(std::uint64_t* zeros) : turn_(zeros), states_(zeros + 1) {}
+  // zeros: one word for each number and one more, all zero.
+  explicit SumStates(std::uint64_t* zeros) : taken_(zeros), states_(zeros + 1) {}
+
+ protected:
+  static constexpr std::uint64_t kOwn = std::uint64_t{1} << 62, kOthers = std::uint64_t{2} << 62;
+
+  __device__ int take() const {
+    return static_cast<int>(Word(*taken_).fetch_add(1, ::cuda::memory_order_relaxed));
+  }
+  __device__ std::uint64_t look(int number) const {
+    return Word(states_[number]).load(::cuda::memory_order_relaxed);
+  }
+  __device__ void set(int number, std::uint64_t kind, std::int64_t sum) const {
+    Word(states_[number]).store(kind | static_cast<std::uint64_t>(sum), ::cuda::memory_order_relaxed);
+  }
+  __device__ static std::int64_t value(std::uint64_t state) {
+    return static_cast<std::int64_t>(state & (kOwn - 1));
+  }
+
+ private:
+  using Word = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;
+  std::uint64_t *taken_, *states_;
+};
+
+// A prefix sum over the blocks of a launch while they run, without a second launch (decoupled look-back,
+// Merrill & Garland 2016). A block first publishes its own sum. It then adds up the sums of its predecessors,
+// from the nearest to the farthest, until it finds one that has published the sum up to and including itself
+// (kOthers). At last the block publishes its own such sum. Blocks are numbered in the order in which they
+// start, so all predecessors of a waiting block run or have run.
+class RunningSum : public SumStates {
+ public:
+  using SumStates::SumStates;
 
   // Returns the block's number. All of its threads call this, and it is a barrier for them. A block may call
   // it again when it knows the sum before its last number; it then does the work of several blocks.
   __device__ int take_turn() const {
     __shared__ int turn;
-    if (threadIdx.x == 0) turn = static_cast<int>(Word(*turn_).fetch_add(1, ::cuda::memory_order_relaxed));
+    if (threadIdx.x == 0) turn = take();
     __syncthreads();
     return turn;
   }
@@ -209,15 +282,15 @@ class RunningSum {
     __shared__ std::int64_t parts[kThreads / 32];
     __shared__ bool ends[kThreads / 32];
     const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
-    if (threadIdx.x == 0) publish(block, kOwn, own);
+    if (threadIdx.x == 0) set(block, kOwn, own);
     std::int64_t sum = 0;
     for (int end = block; end > 0; end -= kThreads) {
       const int at = end - 1 - static_cast<int>(threadIdx.x);
-      std::uint64_t state = kThrough;  // before the first block the sum is 0
+      std::uint64_t state = kOthers;  // before the first block the sum is 0
       do {
-        if (at >= 0) state = Word(states_[at]).load(::cuda::memory_order_relaxed);
+        if (at >= 0) state = look(at);
       } while (__any_sync(kFullWarp, state < kOwn));
-      const unsigned through = __ballot_sync(kFullWarp, state >= kThrough);
+      const unsigned through = __ballot_sync(kFullWarp, state >= kOthers);
       std::int64_t part = lane <= __ffs(through) - 1 || !through ? value(state) : 0;
       for (int step = 16; step > 0; step /= 2) part += __shfl_xor_sync(kFullWarp, part, step);
       __syncthreads();
@@ -233,42 +306,23 @@ class RunningSum {
       }
       if (ended) break;
     }
-    if (threadIdx.x == 0) publish(block, kThrough, sum + own);
+    if (threadIdx.x == 0) set(block, kOthers, sum + own);
     return sum;
   }
-
- private:
-  using Word = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;
-  // The two high bits of a state say whether the rest is the block's own sum or the sum up to and including
-  // the block. Kind and sum are in one word, so no fence is needed to order them.
-  static constexpr std::uint64_t kOwn = std::uint64_t{1} << 62, kThrough = std::uint64_t{2} << 62;
-
-  __device__ static std::int64_t value(std::uint64_t state) {
-    return static_cast<std::int64_t>(state & (kOwn - 1));
-  }
-  __device__ void publish(int block, std::uint64_t kind, std::int64_t sum) const {
-    Word(states_[block]).store(kind | static_cast<std::uint64_t>(sum), ::cuda::memory_order_relaxed);
-  }
-
-  std::uint64_t *turn_, *states_;
 };
 
-// Another prefix sum over the blocks of a launch while they run. A block takes turns (batches of work); each
-// turn has a sum in [0, 2^62), and the block gets the sum over all earlier turns. The first block that calls
-// next() gets no turn: one of its warps adds up the sums in order, and each other block reads one word. The
-// result arrives later than with RunningSum, but it costs the blocks no time if they have other work to do
-// between publish() and before(). Turns are numbered in the order of the calls of next(), so a block that
-// waits for earlier turns waits for blocks that run.
-class TurnSums {
+// Another prefix sum. A block takes turns (batches of work) and gets the sum over all earlier turns
+// (kOthers). The first block that calls next() gets no turn: one of its warps adds up the sums in order, and
+// each other block reads one word. The result arrives later than with RunningSum, but it costs the blocks no
+// time if they have other work to do between publish() and before(). Turns are numbered in the order of the
+// calls of next(), so a block that waits for earlier turns waits for blocks that run.
+class TurnSums : public SumStates {
  public:
-  // zeros: one word for each turn and one more, all zero.
-  explicit TurnSums(std::uint64_t* zeros) : asked_(zeros), states_(zeros + 1) {}
+  using SumStates::SumStates;
 
   // Called by one thread of a block: returns its next turn, or -1, in which case the block's first warp must
   // call add_up() and nothing else. Later turns wait until a turn that was taken is published.
-  __device__ int next() const {
-    return static_cast<int>(Word(*asked_).fetch_add(1, ::cuda::memory_order_relaxed)) - 1;
-  }
+  __device__ int next() const { return take() - 1; }
   // next(), but called by all threads of a block; it is a barrier for them.
   __device__ int first() const {
     __shared__ int turn;
@@ -282,7 +336,7 @@ class TurnSums {
   __device__ std::int64_t before(int turn) const {
     std::uint64_t state;
     do state = look(turn);
-    while (state < kBefore);
+    while (state < kOthers);
     return value(state);
   }
 
@@ -314,31 +368,13 @@ class TurnSums {
 #pragma unroll
       for (int k = 0; k < kEach; ++k) {
         if (lane > last || k >= ready) break;
-        set(begin + k, kBefore, before);
+        set(begin + k, kOthers, before);
         before += value(states[k]);
       }
       sum += __shfl_sync(kFullWarp, until, 31);
       done += kEach * last + __shfl_sync(kFullWarp, ready, last);
     }
   }
-
- private:
-  using Word = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;
-  // The two high bits of a state say whether the rest is the turn's own sum or the sum of all earlier turns.
-  // Kind and sum are in one word, so no fence is needed to order them.
-  static constexpr std::uint64_t kOwn = std::uint64_t{1} << 62, kBefore = std::uint64_t{2} << 62;
-
-  __device__ static std::int64_t value(std::uint64_t state) {
-    return static_cast<std::int64_t>(state & (kOwn - 1));
-  }
-  __device__ std::uint64_t look(int turn) const {
-    return Word(states_[turn]).load(::cuda::memory_order_relaxed);
-  }
-  __device__ void set(int turn, std::uint64_t kind, std::int64_t sum) const {
-    Word(states_[turn]).store(kind | static_cast<std::uint64_t>(sum), ::cuda::memory_order_relaxed);
-  }
-
-  std::uint64_t *asked_, *states_;
 };
 
 }  // namespace blitzgs::cuda

@@ -12,13 +12,58 @@ namespace {
 constexpr int kSplatValues = 9, kPartValues = 16;
 constexpr int kSumThreads = 256;
 
-// The scatter of splats (scatter.h), one block per kScatterBlock splats (scatter_device.cuh).
+constexpr int kFewRanks = 8;  // enough for most hosts, with less shared memory than kMaxRanks
+
+// The scatter of splats (scatter.h), one block per kScatterBlock splats, one thread per splat. RANKS: an
+// upper bound on the number of ranks.
 template <int RANKS>
 __global__ void __launch_bounds__(kScatterBlock)
     scatter_kernel(const __grid_constant__ ScatterSplats splats, const __grid_constant__ SplatGroups groups,
                    const __grid_constant__ ScatterTargets targets, const ScatterState state) {
-  __shared__ ScatterShared<RANKS> shared;
-  scatter_block<kScatterBlock>(shared, splats, splats.count, {groups.size, groups.count}, targets, state);
+  // One struct, so that the addresses of all its arrays come from one register.
+  __shared__ struct {
+    std::uint8_t lists[RANKS][kScatterBlock];  // the block's splats that go to each rank, ascending
+    int before[RANKS][kScatterWarps];          // how many of them come before each warp
+    int counts[RANKS], bases[RANKS];           // those that fit the group, and the first one's position
+  } block;
+  const int n_ranks = groups.count, slot = threadIdx.x, warp = slot / 32, lane = slot % 32;
+  const SplatColumns<const std::int32_t>& columns = splats.columns;
+  const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kScatterBlock);
+  const std::int64_t mask = first + slot < splats.count ? splats.masks[first + slot] : 0;
+  for (int m = 0; m < n_ranks; ++m) {
+    const unsigned going = __ballot_sync(kFullWarp, (mask >> m) & 1);
+    if (lane == 0) block.before[m][warp] = __popc(going);
+  }
+  __syncthreads();
+  if (slot < n_ranks) {
+    int sum = 0;
+#pragma unroll
+    for (int& splats_of_warp : block.before[slot]) {
+      const int count = splats_of_warp;
+      splats_of_warp = sum;
+      sum += count;
+    }
+    const std::int64_t base = state.take(slot, sum), left = groups.size[slot] - base;
+    block.bases[slot] = static_cast<int>(base);
+    block.counts[slot] = left >= sum ? sum : left > 0 ? static_cast<int>(left) : 0;
+  }
+  __syncthreads();
+  for (int m = 0; m < n_ranks; ++m) {
+    const bool goes = (mask >> m) & 1;
+    const unsigned going = __ballot_sync(kFullWarp, goes);
+    const int before = block.before[m][warp];
+    if (goes) block.lists[m][before + __popc(going & ((1u << lane) - 1u))] = static_cast<std::uint8_t>(slot);
+    if (lane == 0 && first + slot < splats.count) {
+      state.places[(first + slot) / kPlaceSplats * n_ranks + m] = {block.bases[m] + before, going};
+    }
+  }
+  __syncthreads();
+  for (int run = warp; run < n_ranks * columns.count; run += kScatterWarps) {
+    const int m = run / columns.count, c = run - m * columns.count;
+    const int width = columns.begin[c + 1] - columns.begin[c];
+    copy_run(columns.data[c] + first * width, block.lists[m], block.counts[m], width,
+             targets.words[m][c] + std::int64_t{block.bases[m]} * width);
+  }
 }
 
 // The gather of splats (scatter.h): block (x, y) copies a part of column y % columns.count of group
@@ -121,11 +166,9 @@ void scatter(const ScatterSplats& splats, const SplatGroups& groups, const Scatt
   if (splats.count == 0) return;
   auto* filled = workspace.allocate<std::int64_t>(groups.count);
   check(cudaMemsetAsync(filled, 0, groups.count * sizeof(*filled), stream), "scatter_splats");
-  dispatch_ranks(groups.count, [&](auto ranks) {
-    scatter_kernel<ranks.value>
-        <<<static_cast<unsigned>(scatter_blocks(splats.count)), kScatterBlock, 0, stream>>>(
-            splats, groups, targets, ScatterState{filled, places});
-  });
+  const auto kernel = groups.count <= kFewRanks ? scatter_kernel<kFewRanks> : scatter_kernel<kMaxRanks>;
+  kernel<<<blocks_for(splats.count, kScatterBlock), kScatterBlock, 0, stream>>>(splats, groups, targets,
+                                                                                ScatterState{filled, places});
   check_launch("scatter_splats");
 }
 

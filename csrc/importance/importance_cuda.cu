@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "importance/importance.h"
 
-#include <string>
 #include <type_traits>
 
 #include "common/cuda.cuh"
@@ -32,8 +31,8 @@ struct __align__(8) TileSum {
     atomicAdd(&low, static_cast<std::uint32_t>(sum) & ((1u << kLowBits) - 1));
     atomicAdd(&high, static_cast<std::uint32_t>(sum >> kLowBits) | pixels << kPixelShift);
   }
-  __device__ __forceinline__ unsigned long long sum() const {
-    const unsigned long long rest = high & ((1u << kPixelShift) - 1);
+  __device__ __forceinline__ std::int64_t sum() const {
+    const std::int64_t rest = high & ((1u << kPixelShift) - 1);
     return (rest << kLowBits) + low;
   }
   __device__ __forceinline__ std::uint32_t pixels() const { return high >> kPixelShift; }
@@ -55,14 +54,11 @@ __device__ __forceinline__ void copy_color(float* shared, NoColors<kSquares>, st
 // Adds the sums of an entry over a tile to those of its splat.
 template <bool kSquares>
 __device__ __forceinline__ void send_sums(Entry& entry, std::int32_t splat, const ContributionSums& sums) {
-  const auto add = [splat](std::int64_t* all, const TileSum& one) {
-    atomicAdd(reinterpret_cast<unsigned long long*>(all + splat), one.sum());
-  };
   const TileSum weights = sums_of(entry)[0];
   if (weights.pixels() == 0) return;  // no pixel composited the entry
-  add(sums.weights, weights);
+  atomic_add(sums.weights + splat, weights.sum());
   atomicAdd(sums.pixels + splat, static_cast<std::int32_t>(weights.pixels()));
-  if constexpr (kSquares) add(sums.squares, sums_of(entry)[1]);
+  if constexpr (kSquares) atomic_add(sums.squares + splat, sums_of(entry)[1].sum());
 }
 
 struct ContributionShared {

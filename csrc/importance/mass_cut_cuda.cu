@@ -31,10 +31,6 @@ struct WideSum {
   __device__ std::int64_t value() const { return static_cast<std::int64_t>(high) << 32 | low; }
 };
 
-__device__ void add_to(std::int64_t* sum, std::int64_t amount) {
-  atomicAdd(reinterpret_cast<unsigned long long*>(sum), static_cast<unsigned long long>(amount));
-}
-
 // The scan of round 0: sums the weights of all items by their first digit into sums [S, kDigits]. One thread
 // per item in a grid-stride loop. The blocks of grid row y handle the segments from y * kSegmentsAtOnce on.
 __global__ void __launch_bounds__(kThreads) first_scan_kernel(const MassCutArgs args) {
@@ -57,12 +53,12 @@ __global__ void __launch_bounds__(kThreads) first_scan_kernel(const MassCutArgs 
   for (int i = threadIdx.x; i < n_segments * kFirstDigits; i += kThreads) {
     const std::int64_t sum = digits[i].value();
     const int segment = first_segment + i / kFirstDigits;
-    if (sum != 0) add_to(args.sums + std::int64_t{segment} * kDigits + i % kFirstDigits, sum);
+    if (sum != 0) atomic_add(args.sums + std::int64_t{segment} * kDigits + i % kFirstDigits, sum);
   }
 }
 
 __device__ void add_term(const MassCutArgs& args, std::int64_t segment, const ScanTerm& term) {
-  if (term.adds) add_to(args.sums + segment * kDigits + term.digit, term.amount);
+  if (term.adds) atomic_add(args.sums + segment * kDigits + term.digit, term.amount);
 }
 
 // The scan of round 1: lists the items with the first digit of their segment's threshold, and sums their

@@ -49,16 +49,6 @@ __device__ __forceinline__ Owned clip_to_owned(const TileGrid& grid, int camera,
   return {max(base + begin, 0), min(base + end, static_cast<int>(grid.tile_end - grid.tile_begin)), ty};
 }
 
-// Calls f(owned tiles) for each tile row that the splat touches.
-template <class F>
-__device__ __forceinline__ void for_each_owned(const TileGrid& grid, const SplatShape& splat, const F& f) {
-  for_each_tile_row(splat.mean, splat.conic, splat.opacity, grid.width, grid.height, grid.tile_size,
-                    [&](int ty, int begin, int end) {
-                      const Owned owned = clip_to_owned(grid, splat.camera, ty, begin, end);
-                      if (owned.first < owned.last) f(owned);
-                    });
-}
-
 // The owned tiles that a splat touches: the first tile (counted from tile_begin) and a byte for each of up to
 // twelve tile rows. The low half of a byte is the number of tiles in the row. The high half is 8 plus the
 // column of the row's first tile minus the column of the first tile of all. A splat that does not fit this
@@ -119,7 +109,9 @@ __device__ __forceinline__ Touched find_touched(const TileGrid& grid, const Spla
   int count = 0, first = 0, top = 0;
   bool fits = true;
   Touched touched{};
-  for_each_owned(grid, splat, [&](const Owned& owned) {
+  const auto add = [&](int ty, int begin, int end) {
+    const Owned owned = clip_to_owned(grid, splat.camera, ty, begin, end);
+    if (owned.first >= owned.last) return;
     if (count == 0) {
       first = owned.first;
       top = owned.ty;
@@ -131,7 +123,8 @@ __device__ __forceinline__ Touched find_touched(const TileGrid& grid, const Spla
 #pragma unroll
     for (int i = 0; i < Touched::kWords; ++i) touched.rows[i] |= down >> 2 == i ? bits : 0u;
     count += n;
-  });
+  };
+  for_each_tile_row(splat.mean, splat.conic, splat.opacity, grid.width, grid.height, grid.tile_size, add);
   touched.first = static_cast<std::uint32_t>(first);
   if (!fits) {
     touched.first = Touched::kLarge;
@@ -145,12 +138,6 @@ inline constexpr int kDepthPasses = 3, kDepthBits = 9, kDepthBins = 1 << kDepthB
 inline constexpr int kRangeBlocks = kDepthThreads, kRangeThreads = 512;
 inline constexpr int kTieItems = 4, kTieSplats = kDepthThreads * kTieItems;
 inline constexpr int kShortRun = 16;  // the longest run of equal keys that one thread orders
-
-// Maps floats to unsigned integers of the same order.
-__device__ __forceinline__ std::uint32_t ordered_bits(float depth) {
-  const std::uint32_t bits = __float_as_uint(depth);
-  return bits ^ (bits >> 31 ? 0xffffffffu : 0x80000000u);
-}
 
 // The smallest and the largest of some depths, as ordered_bits().
 struct DepthRange {

@@ -16,7 +16,6 @@
 // contraction (cmake/cuda.cmake), like the projection, because both must count the same tiles.
 #include <cub/device/device_reduce.cuh>
 
-#include <algorithm>
 #include <cuda/std/functional>
 
 #include "common/cuda.cuh"
@@ -297,10 +296,10 @@ DepthOrder order_by_depth(const Input& in, const Counters<State>& counters, Work
   std::int32_t* const splats[] = {splats_0, splats_1};
   launch_early("intersect", range_kernel, {kRangeBlocks, kRangeThreads, stream}, in, counters.ranges,
                counters.begin, counters.n_zeros);
-  const unsigned blocks =
-      std::min(blocks_for(n, kDepthThreads), static_cast<unsigned>(kDepthBlocks * multiprocessors()));
-  launch_early("intersect", depth_keys_kernel, {blocks, kDepthThreads, stream}, in, counters.ranges, keys[0],
-               touched, counters.depth_histograms, counters.dropped_bits, counters.width, counters.n_splats);
+  launch_early("intersect", depth_keys_kernel,
+               {resident_blocks(n, kDepthThreads, kDepthBlocks), kDepthThreads, stream}, in, counters.ranges,
+               keys[0], touched, counters.depth_histograms, counters.dropped_bits, counters.width,
+               counters.n_splats);
   int from = 0;
   for (int pass = 0; pass < kDepthPasses; ++pass, from = 1 - from) {
     const std::int64_t bins = pass * kDepthBins;
@@ -331,10 +330,9 @@ void list_splats(const Input& in, std::int64_t capacity, std::int32_t* isect_spl
   launch_early("intersect", emit_kernel<Key>, {counters.emit_blocks, kThreads, stream}, in, order.touched,
                order.splats, counters.n_splats, RunningSum(counters.running), written, counters.n_entries,
                order.spare, counters.n_large);
-  const unsigned large_blocks = std::min(blocks_for(in.n_splats, kThreads / 32),
-                                         static_cast<unsigned>(kLargeBlocks * multiprocessors()));
-  launch_early("intersect", emit_large_kernel<Key>, {large_blocks, kThreads, stream}, in, order.touched,
-               order.spare, counters.n_large, written);
+  launch_early("intersect", emit_large_kernel<Key>,
+               {resident_blocks(in.n_splats, kThreads / 32, kLargeBlocks), kThreads, stream}, in,
+               order.touched, order.spare, counters.n_large, written);
   int from = 0;
   for (int pass = 0; pass < digits.passes; ++pass, from = 1 - from) {
     const std::int64_t bins = pass * TileDigits::kBins;
@@ -359,17 +357,11 @@ std::int64_t count_intersections<float>(const Input& in, Workspace& workspace, C
   auto* total = workspace.allocate<std::int64_t>(1);
   count_kernel<<<blocks_for(in.n_splats, kThreads), kThreads, 0, stream>>>(in, counts);
   check_launch("intersect");
-  std::size_t bytes = 0;
-  const auto sum = [&](void* scratch) {
+  run_cub("intersect", workspace, [&](void* scratch, std::size_t& bytes) {
     return cub::DeviceReduce::Reduce(scratch, bytes, counts, total, in.n_splats,
                                      ::cuda::std::plus<std::int64_t>{}, std::int64_t{0}, stream);
-  };
-  check(sum(nullptr), "intersect");
-  check(sum(workspace.allocate_bytes(bytes)), "intersect");
-  std::int64_t host = 0;
-  check(cudaMemcpyAsync(&host, total, sizeof(host), cudaMemcpyDeviceToHost, stream), "intersect");
-  check(cudaStreamSynchronize(stream), "intersect");
-  return host;
+  });
+  return read_back("intersect", total, stream);
 }
 
 template <>

@@ -29,6 +29,7 @@
 #include <cstdint>
 
 #include "common/kernel.h"
+#include "math/vec.h"
 
 namespace blitzgs {
 
@@ -100,18 +101,6 @@ template <class T>
 struct SsimTerms {
   T value, by_mean, by_p, by_q;
 };
-
-// The reciprocal of a normal number; on a GPU its error is at most 1 ulp.
-template <class T>
-BLITZGS_HD T reciprocal(T x) {
-#ifdef __CUDA_ARCH__
-  T result;
-  asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(result) : "f"(x));
-  return result;
-#else
-  return T(1) / x;
-#endif
-}
 
 template <class T>
 BLITZGS_HD SsimTerms<T> ssim_terms(T mean_x, T e, T p, T q) {

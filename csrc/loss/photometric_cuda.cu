@@ -315,53 +315,43 @@ int block_columns(const PhotometricArgs<float>& args) { return (args.width + kOu
 // Divides the owned rows into strips such that the blocks fill whole waves of the device and few rows are
 // read twice.
 Launch cut_strips(const PhotometricArgs<float>& args) {
-  Launch result{};
-  result.view_strips = 1;
-  if (args.tile_begin == args.tile_end) return result;
+  Launch launch{};
+  launch.view_strips = 1;
+  if (args.tile_begin == args.tile_end) return launch;
   const int columns = block_columns(args), slots = 2 * multiprocessors();
-  Launch* launch = &result;
   const std::int64_t tiles = std::int64_t{args.tiles_x} * args.tiles_y;
   const std::int64_t last = args.tile_end - 1;
-  launch->first_view = static_cast<int>(args.tile_begin / tiles);
-  launch->last_view = static_cast<int>(last / tiles);
-  launch->begin_row = static_cast<int>(args.tile_begin % tiles / args.tiles_x * args.tile_size);
-  launch->end_row =
+  launch.first_view = static_cast<int>(args.tile_begin / tiles);
+  launch.last_view = static_cast<int>(last / tiles);
+  launch.begin_row = static_cast<int>(args.tile_begin % tiles / args.tiles_x * args.tile_size);
+  launch.end_row =
       std::min(args.height, static_cast<int>((last % tiles / args.tiles_x + 1) * args.tile_size));
-  const int views = launch->last_view - launch->first_view;
-  const int first_rows = (views ? args.height : launch->end_row) - launch->begin_row;
+  const int views = launch.last_view - launch.first_view;
+  const int first_rows = (views ? args.height : launch.end_row) - launch.begin_row;
   constexpr int kLeadCost = 24;  // the work of a strip before its first output, in rows
   std::int64_t best_cost = LLONG_MAX;
   for (int pieces = 1; pieces <= cut(args.height, 16); ++pieces) {
     const int rows = cut(cut(args.height, pieces), kRows) * kRows;
     int strips = cut(first_rows, rows);
-    if (views) strips += (views - 1) * cut(args.height, rows) + cut(launch->end_row, rows);
+    if (views) strips += (views - 1) * cut(args.height, rows) + cut(launch.end_row, rows);
     const std::int64_t waves = (std::int64_t{columns} * strips + slots - 1) / slots;
     const std::int64_t cost = waves * (rows + kLeadCost);
     if (cost >= best_cost) continue;
     best_cost = cost;
-    launch->strips = strips;
-    launch->rows_per_strip = rows;
-    launch->first_strips = cut(first_rows, rows);
-    launch->view_strips = cut(args.height, rows);
+    launch.strips = strips;
+    launch.rows_per_strip = rows;
+    launch.first_strips = cut(first_rows, rows);
+    launch.view_strips = cut(args.height, rows);
   }
-  return result;
-}
-
-template <bool kBytes, bool kGradient, bool kSums>
-void launch_kernel(dim3 grid, const PhotometricArgs<float>& args, const Launch& launch, cudaStream_t stream) {
-  launch_early("photometric", photometric_kernel<kBytes, kGradient, kSums>,
-               {grid, kThreads, stream, 2 * sizeof(Shared)}, args, launch);
+  return launch;
 }
 
 template <bool kBytes>
-void launch_strips(dim3 grid, const PhotometricArgs<float>& args, const Launch& launch, cudaStream_t stream) {
-  if (args.v_renders && args.parts) {
-    launch_kernel<kBytes, true, true>(grid, args, launch, stream);
-  } else if (args.v_renders) {
-    launch_kernel<kBytes, true, false>(grid, args, launch, stream);
-  } else {
-    launch_kernel<kBytes, false, true>(grid, args, launch, stream);
-  }
+void launch_strips(dim3 grid, const PhotometricArgs<float>& args, const Launch& launch, CudaStream stream) {
+  const auto kernel = !args.v_renders ? photometric_kernel<kBytes, false, true>
+                      : args.parts    ? photometric_kernel<kBytes, true, true>
+                                      : photometric_kernel<kBytes, true, false>;
+  launch_early("photometric", kernel, {grid, kThreads, stream, 2 * sizeof(Shared)}, args, launch);
 }
 
 // Sets v_renders to zero before the first row and after the last row with an owned pixel.

@@ -17,6 +17,7 @@
 #include <cstdint>
 
 #include "common/kernel.h"
+#include "common/rows.h"
 #include "math/morton.h"
 
 namespace blitzgs {
@@ -38,41 +39,32 @@ struct KnnTree {
   int levels;                 // the top level has one node
   std::int64_t offset[kKnnLevels];
   std::int32_t count[kKnnLevels];
-  const KnnBox<T>* boxes;
+  KnnBox<T>* boxes;
 };
 
-// Computes the sizes of the levels above n sorted points; returns the number of boxes.
+// Row i: the box of node i of a level, around 8 points (level 0) or around 8 boxes of the level below.
 template <class T>
-std::int64_t plan_knn_levels(std::int32_t n, KnnTree<T>& tree) {
-  std::int64_t total = 0;
-  std::int32_t count = n;
-  tree.levels = 0;
-  do {
-    count = static_cast<std::int32_t>((static_cast<std::int64_t>(count) + kKnnFan - 1) / kKnnFan);
-    tree.offset[tree.levels] = total;
-    tree.count[tree.levels++] = count;
-    total += count;
-  } while (count > 1);
-  return total;
-}
+struct KnnLevel {
+  KnnTree<T> tree;
+  int level;
+  std::int64_t n;
 
-// The box of node i of a level: around 8 points (level 0) or around 8 boxes of the level below.
-template <class T>
-BLITZGS_HD KnnBox<T> make_knn_box(const KnnTree<T>& tree, int level, std::int32_t i) {
-  const std::int64_t begin = std::int64_t{i} * kKnnFan;
-  const std::int64_t below = level == 0 ? tree.n : tree.count[level - 1];
-  const std::int64_t end = begin + kKnnFan < below ? begin + kKnnFan : below;
-  KnnBox<T> box;
-  for (std::int64_t j = begin; j < end; ++j) {
-    const T* low = level == 0 ? tree.points + 3 * j : tree.boxes[tree.offset[level - 1] + j].low;
-    const T* high = level == 0 ? low : tree.boxes[tree.offset[level - 1] + j].high;
-    for (int axis = 0; axis < 3; ++axis) {
-      box.low[axis] = j == begin || low[axis] < box.low[axis] ? low[axis] : box.low[axis];
-      box.high[axis] = j == begin || high[axis] > box.high[axis] ? high[axis] : box.high[axis];
+  BLITZGS_HD void operator()(std::int64_t i) const {
+    const std::int64_t begin = i * kKnnFan;
+    const std::int64_t below = level == 0 ? tree.n : tree.count[level - 1];
+    const std::int64_t end = begin + kKnnFan < below ? begin + kKnnFan : below;
+    KnnBox<T> box;
+    for (std::int64_t j = begin; j < end; ++j) {
+      const T* low = level == 0 ? tree.points + 3 * j : tree.boxes[tree.offset[level - 1] + j].low;
+      const T* high = level == 0 ? low : tree.boxes[tree.offset[level - 1] + j].high;
+      for (int axis = 0; axis < 3; ++axis) {
+        box.low[axis] = j == begin || low[axis] < box.low[axis] ? low[axis] : box.low[axis];
+        box.high[axis] = j == begin || high[axis] > box.high[axis] ? high[axis] : box.high[axis];
+      }
     }
+    tree.boxes[tree.offset[level] + i] = box;
   }
-  return box;
-}
+};
 
 // A query for one point. best: the K smallest squared distances found so far, ascending.
 template <class T, int K>
@@ -181,6 +173,23 @@ void with_knn_length(int k, const F& f) {
 }
 
 namespace BLITZGS_BACKEND {
+// Makes the levels of a tree above its sorted points.
+template <class T>
+void make_knn_boxes(KnnTree<T>& tree, Workspace& workspace, CudaStream stream) {
+  std::int64_t total = 0;
+  std::int32_t count = tree.n;
+  do {
+    count = static_cast<std::int32_t>((static_cast<std::int64_t>(count) + kKnnFan - 1) / kKnnFan);
+    tree.offset[tree.levels] = total;
+    tree.count[tree.levels++] = count;
+    total += count;
+  } while (count > 1);
+  tree.boxes = workspace.allocate<KnnBox<T>>(total);
+  for (int level = 0; level < tree.levels; ++level) {
+    for_each_row(KnnLevel<T>{tree, level, tree.count[level]}, stream);
+  }
+}
+
 template <class T>
 void knn_distances(const T* points, std::int32_t n, int k, T* distances, Workspace&, CudaStream);
 }  // namespace BLITZGS_BACKEND

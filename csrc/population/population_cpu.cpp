@@ -89,13 +89,7 @@ void knn_distances(const T* points, std::int32_t n, int k, T* distances, Workspa
   });
   tree.points = sorted;
   tree.order = order;
-  KnnBox<T>* boxes = workspace.allocate<KnnBox<T>>(plan_knn_levels(tree.n, tree));
-  tree.boxes = boxes;
-  for (int level = 0; level < tree.levels; ++level) {
-    parallel_rows(tree.count[level], 1 << 12, [&](std::int64_t i) {
-      boxes[tree.offset[level] + i] = make_knn_box(tree, level, static_cast<std::int32_t>(i));
-    });
-  }
+  make_knn_boxes(tree, workspace, nullptr);
   with_knn_length(k, [&]<int K>() {
     parallel_rows(tree.n, 1 << 10,
                   [&](std::int64_t i) { knn_row<T, K>(tree, static_cast<std::int32_t>(i), k, distances); });

@@ -1,5 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
 
 #include <cub/cub.cuh>
 
@@ -100,7 +99,7 @@ __global__ void __launch_bounds__(kKeyThreads) key_histogram_kernel(const KeyHis
   }
   __syncthreads();
   for (int i = threadIdx.x; i < digits; i += kKeyThreads) {
-    if (counts[i] > 0) atomicAdd(reinterpret_cast<unsigned long long*>(args.counts + i), counts[i]);
+    if (counts[i] > 0) atomic_add(args.counts + i, counts[i]);
   }
 }
 
@@ -141,14 +140,6 @@ __global__ void gather_points(const float* points, const std::int32_t* order, st
   for (int axis = 0; axis < 3; ++axis) sorted[3 * i + axis] = points[3 * std::int64_t{order[i]} + axis];
 }
 
-// The boxes of one level of the tree, one thread per box.
-__global__ void make_boxes(const KnnTree<float> tree, int level, KnnBox<float>* boxes) {
-  const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
-  if (i < tree.count[level]) {
-    boxes[tree.offset[level] + i] = make_knn_box(tree, level, static_cast<std::int32_t>(i));
-  }
-}
-
 // distances [N, k], one thread per sorted point.
 template <int K>
 __global__ void __launch_bounds__(kQueryThreads)
@@ -170,16 +161,10 @@ std::int32_t sort_along_curve(const float* points, std::int32_t n, std::int32_t*
   std::uint64_t* codes = workspace.allocate<std::uint64_t>(2 * std::int64_t{n});
   std::int32_t* rows = workspace.allocate<std::int32_t>(n);
   make_codes<<<blocks_for(n, 256), 256, 0, stream>>>(points, n, bounds, codes, rows);
-  std::size_t bytes = 0;
-  const auto sort = [&](void* scratch) {  // null: sets the bytes of scratch memory that it needs
+  run_cub("knn", workspace, [&](void* scratch, std::size_t& bytes) {
     return cub::DeviceRadixSort::SortPairs(scratch, bytes, codes, codes + n, rows, order, n, 0, 64, stream);
-  };
-  check(sort(nullptr), "knn");
-  check(sort(workspace.allocate_bytes(bytes)), "knn");
-  std::int32_t finite = 0;
-  check(cudaMemcpyAsync(&finite, &bounds->finite, sizeof(finite), cudaMemcpyDeviceToHost, stream), "knn");
-  check(cudaStreamSynchronize(stream), "knn");
-  return finite;
+  });
+  return read_back("knn", &bounds->finite, stream);
 }
 
 }  // namespace
@@ -214,6 +199,7 @@ template void for_each_row(const BracketKeys&, CudaStream);
 template void for_each_row(const MatchBrackets&, CudaStream);
 template void for_each_row(const SamplingKeys&, CudaStream);
 template void for_each_row(const KeysUpTo&, CudaStream);
+template void for_each_row(const KnnLevel<float>&, CudaStream);
 
 void copy_rows(const CopyRows& copy, CudaStream stream) {
   if (copy.n == 0 || copy.row_bytes == 0) return;
@@ -225,9 +211,7 @@ void copy_rows(const CopyRows& copy, CudaStream stream) {
 void key_histogram(const KeyHistogram& args, CudaStream stream) {
   check(cudaMemsetAsync(args.counts, 0, sizeof(*args.counts) << args.width, stream), "key_histogram");
   if (args.n == 0) return;
-  const auto blocks =
-      std::min(blocks_for(args.n, kKeyThreads), static_cast<unsigned>(kResident * multiprocessors()));
-  key_histogram_kernel<<<blocks, kKeyThreads, 0, stream>>>(args);
+  key_histogram_kernel<<<resident_blocks(args.n, kKeyThreads, kResident), kKeyThreads, 0, stream>>>(args);
   check_launch("key_histogram");
 }
 
@@ -250,11 +234,7 @@ void knn_distances(const T* points, std::int32_t n, int k, T* distances, Workspa
   gather_points<<<blocks_for(tree.n, 256), 256, 0, stream>>>(points, order, tree.n, sorted);
   tree.points = sorted;
   tree.order = order;
-  KnnBox<float>* boxes = workspace.allocate<KnnBox<float>>(plan_knn_levels(tree.n, tree));
-  tree.boxes = boxes;
-  for (int level = 0; level < tree.levels; ++level) {
-    make_boxes<<<blocks_for(tree.count[level], 256), 256, 0, stream>>>(tree, level, boxes);
-  }
+  make_knn_boxes(tree, workspace, stream);
   with_knn_length(k, [&]<int K>() {
     query_kernel<K><<<blocks_for(tree.n, kQueryThreads), kQueryThreads, 0, stream>>>(tree, k, distances);
   });

@@ -30,6 +30,7 @@
 #pragma once
 #include <cstddef>
 #include <cstdint>
+#include <functional>
 #include <variant>
 
 #include "adam/lazy_adam.h"
@@ -155,6 +156,13 @@ struct ProjectSizes {
 struct ProjectCapacity {
   ProjectSizes sizes;
   const std::int64_t* totals;
+
+  // The actual numbers, or zeros if they exceed the capacity. (CUDA: in a kernel.)
+  BLITZGS_HD ProjectSizes fitting() const {
+    if (!totals) return sizes;
+    const ProjectSizes actual{totals[kTotalVisible], totals[kTotalSplats]};
+    return actual.visible <= sizes.visible && actual.splats <= sizes.splats ? actual : ProjectSizes{0, 0};
+  }
 };
 
 // gaussian_ids [P] and camera_ids [P]: the Gaussian and the view of each splat. visible_ids [U]: the
@@ -183,17 +191,9 @@ struct ProjectColumns {
   ProjectOutputs<T> values;
 };
 
-// The caller of project() implements this class to provide the memory for the splats.
+// Provides the memory for so many visible Gaussians and splats.
 template <class T>
-class SplatMemory {
- public:
-  virtual ~SplatMemory() = default;
-  // CUDA: the capacity that the caller chose before the number of splats is known; null: project() waits for
-  // the number and allocates exactly as much.
-  virtual const ProjectSizes* capacity() const = 0;
-  // project() calls this once, with the capacity or with the counted sizes.
-  virtual ProjectColumns<T> allocate(const ProjectSizes&) = 0;
-};
+using SplatMemory = std::function<ProjectColumns<T>(const ProjectSizes&)>;
 
 // The outputs of the backward pass. By default there is one row for each visible Gaussian, [U, ...] (sh
 // [U, K, 3], null without sh). With `dense` there is one row for each Gaussian, [N, ...]; the caller fills
@@ -239,11 +239,13 @@ ProjectGradients<T> scratch_gradients(const SplatIndex& splats, AdamArgs<T>& ada
 }
 
 namespace BLITZGS_BACKEND {
-// If there are more splats than the capacity (CUDA), the totals are still correct, and the columns hold the
-// first splats, without colours. The caller has to compare the totals with the capacity.
+// Calls `memory` once. capacity (CUDA): what the caller chose before the number of splats is known; null:
+// waits for the number and takes memory for exactly as many. If there are more splats than the capacity, the
+// totals are still correct, and the columns hold the first splats, without colours; the caller has to compare
+// the two.
 template <class T>
-void project(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t* totals, Workspace&,
-             CudaStream);
+void project(const ProjectInputs<T>&, const RankTiles&, const ProjectSizes* capacity,
+             const SplatMemory<T>& memory, std::int64_t* totals, Workspace&, CudaStream);
 // Computes the colours of the splats that project() wrote without `sh`, and hides those whose colour is not
 // finite. It reads the means, the SH and the cameras of its inputs, whose rows `gaussian_ids` counts, and
 // writes colors, opacities, radii and tiles_touched; other columns may be null. It does nothing if there are

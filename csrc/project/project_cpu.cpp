@@ -164,8 +164,8 @@ void reduce_poses(const double* sums, std::int64_t n_blocks, int n_views, T* v_v
 }  // namespace
 
 template <class T>
-void project(const ProjectInputs<T>& in, const RankTiles& rank_tiles, SplatMemory<T>& memory,
-             std::int64_t* totals, Workspace&, CudaStream) {
+void project(const ProjectInputs<T>& in, const RankTiles& rank_tiles, const ProjectSizes*,
+             const SplatMemory<T>& memory, std::int64_t* totals, Workspace&, CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
   std::vector<Frustum> frusta;
   for (const Camera<T>& camera : cameras) frusta.push_back(frustum_of(camera, in.options));
@@ -189,7 +189,7 @@ void project(const ProjectInputs<T>& in, const RankTiles& rank_tiles, SplatMemor
     block.visible_before = std::exchange(visible, visible + block.visible);
     block.splats_before = std::exchange(splats, splats + static_cast<std::int64_t>(block.splats.size()));
   }
-  const ProjectColumns<T> columns = memory.allocate({visible, splats});
+  const ProjectColumns<T> columns = memory({visible, splats});
   const ProjectIds& ids = columns.ids;
   ids.splat_offsets[visible] = static_cast<std::int32_t>(splats);
   parallel_rows(std::ssize(blocks), 1, [&](std::int64_t b) {
@@ -251,8 +251,8 @@ void zero_arrays(const ZeroedArrays<T>& arrays, CudaStream) {
 }
 
 #define BLITZGS_INSTANTIATE(T)                                                                              \
-  template void project<T>(const ProjectInputs<T>&, const RankTiles&, SplatMemory<T>&, std::int64_t*,       \
-                           Workspace&, CudaStream);                                                         \
+  template void project<T>(const ProjectInputs<T>&, const RankTiles&, const ProjectSizes*,                  \
+                           const SplatMemory<T>&, std::int64_t*, Workspace&, CudaStream);                   \
   template void color_splats<T>(const ProjectInputs<T>&, const ProjectCapacity&, const ProjectColumns<T>&,  \
                                 CudaStream);                                                                \
   template void project_bwd<T>(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&,  \

@@ -8,8 +8,6 @@
 #include "project/project_device.cuh"
 #include "project/unscented.h"
 
-#include <algorithm>
-
 namespace blitzgs::cuda {
 
 namespace {
@@ -167,7 +165,7 @@ __global__ void __launch_bounds__(kColorThreads, kColorBlocks)
   __shared__ TripleStage triples[kColorThreads / 32];
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   ShStage<DEGREE>& stage = stages[QUADS ? warp : 0];
-  const std::int64_t n_splats = fitting(capacity).splats, step = gridDim.x * std::int64_t{kSplatsOfBlock};
+  const std::int64_t n_splats = capacity.fitting().splats, step = gridDim.x * std::int64_t{kSplatsOfBlock};
   const std::int64_t block_start = blockIdx.x * std::int64_t{kSplatsOfBlock};
   if (block_start >= n_splats) return;
   load_cameras(in, cameras);
@@ -195,41 +193,38 @@ void prefilter(const Inputs& in, const Prefiltered& kept, Workspace& workspace, 
     check(cudaMemsetAsync(kept.count, 0, sizeof(*kept.count), stream), "project");
     return;
   }
-  const std::int64_t blocks = std::min<std::int64_t>(turns, kBlocksPerMultiprocessor * multiprocessors());
-  auto* zeros = turn_zeros(turns, workspace, stream);
-  prefilter_kernel<<<static_cast<unsigned>(blocks), kPrefilterThreads, 0, stream>>>(in, kept,
-                                                                                    RunningSum(zeros));
+  prefilter_kernel<<<resident_blocks(turns, 1, kBlocksPerMultiprocessor), kPrefilterThreads, 0, stream>>>(
+      in, kept, RunningSum(turn_zeros(turns, workspace, stream)));
   check_launch("project");
 }
 
 void write_colors(const Inputs& in, const ProjectCapacity& capacity, const ProjectColumns<float>& columns,
                   CudaStream stream) {
   if (capacity.sizes.splats == 0 || !in.sh) return;
-  const std::int64_t blocks = (capacity.sizes.splats + kSplatsOfBlock - 1) / kSplatsOfBlock;
+  const unsigned blocks = blocks_for(capacity.sizes.splats, kSplatsOfBlock);
   dispatch_sh(in, [&](auto degree, auto quads) {
-    color_kernel<degree.value, quads.value><<<static_cast<unsigned>(blocks), kColorThreads, 0, stream>>>(
-        in, columns.ids, capacity, columns.values);
+    color_kernel<degree.value, quads.value>
+        <<<blocks, kColorThreads, 0, stream>>>(in, columns.ids, capacity, columns.values);
   });
   check_launch("project");
 }
 
 template <>
-void project<float>(const Inputs& in, const RankTiles& rank_tiles, SplatMemory<float>& memory,
-                    std::int64_t* totals, Workspace& workspace, CudaStream stream) {
+void project<float>(const Inputs& in, const RankTiles& rank_tiles, const ProjectSizes* capacity,
+                    const SplatMemory<float>& memory, std::int64_t* totals, Workspace& workspace,
+                    CudaStream stream) {
   const Prefiltered kept(in.n_candidates, workspace);
   prefilter(in, kept, workspace, stream);
-  if (const ProjectSizes* capacity = memory.capacity()) {
-    const ProjectColumns<float> columns = memory.allocate(*capacity);
+  if (capacity) {
+    const ProjectColumns<float> columns = memory(*capacity);
     write_splats(in, rank_tiles, kept, *capacity, columns, totals, workspace, stream);
     write_colors(in, {*capacity, totals}, columns, stream);
     return;
   }
   write_splats(in, rank_tiles, kept, {0, 0}, {}, totals, workspace, stream);
-  std::int64_t counted[kTotalSplats + 1];
-  check(cudaMemcpyAsync(counted, totals, sizeof(counted), cudaMemcpyDeviceToHost, stream), "project");
-  check(cudaStreamSynchronize(stream), "project");
-  const ProjectSizes sizes{counted[kTotalVisible], counted[kTotalSplats]};
-  const ProjectColumns<float> columns = memory.allocate(sizes);
+  static_assert(kTotalVisible == 0 && kTotalSplats == 1);
+  const auto sizes = read_back("project", reinterpret_cast<const ProjectSizes*>(totals), stream);
+  const ProjectColumns<float> columns = memory(sizes);
   write_splats(in, rank_tiles, kept, sizes, columns, nullptr, workspace, stream);
   write_colors(in, {sizes, nullptr}, columns, stream);
 }

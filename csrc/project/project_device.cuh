@@ -126,12 +126,6 @@ struct ShRow {
   }
 };
 
-// Whether rows of `stride` floats at `sh` can be read and written 16 bytes at a time.
-template <int DEGREE>
-bool quads_fit(const float* sh, int stride) {
-  return ShRow<DEGREE>::kWhole && sh && stride % 4 == 0 && aligned16(sh);
-}
-
 // Shared memory for the 32 SH rows of a warp. In each load or store the lanes move consecutive 16-byte pieces
 // of two or three rows. One lane per row would touch 32 cache lines at a time.
 template <int DEGREE>
@@ -204,7 +198,7 @@ struct ShStage {
 template <class F>
 void dispatch_sh(const Inputs& in, const F& f) {
   const auto with_degree = [&](auto degree) {
-    if (quads_fit<degree.value>(in.sh, 3 * in.options.sh_stride)) {
+    if (in.sh && 3 * in.options.sh_stride % 4 == 0 && aligned16(in.sh)) {
       f(degree, std::bool_constant<ShRow<degree.value>::kWhole>{});
     } else {
       f(degree, std::false_type{});
@@ -263,16 +257,6 @@ inline std::uint64_t* turn_zeros(std::int64_t turns, Workspace& workspace, CudaS
 // The number of valid candidates.
 __device__ inline std::int64_t candidates_of(const Inputs& in) {
   return in.n_active ? *in.n_active : in.n_candidates;
-}
-
-// The numbers of visible Gaussians and splats that write_splats wrote, or zeros if they exceeded the
-// capacity.
-__device__ inline ProjectSizes fitting(const ProjectCapacity& capacity) {
-  if (!capacity.totals) return capacity.sizes;
-  const ProjectSizes sizes{capacity.totals[kTotalVisible], capacity.totals[kTotalSplats]};
-  return sizes.visible <= capacity.sizes.visible && sizes.splats <= capacity.sizes.splats
-             ? sizes
-             : ProjectSizes{0, 0};
 }
 
 // The output of the prefilter: the Gaussians that some view may see, in the order of the candidates, and

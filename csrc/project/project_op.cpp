@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "project/project.h"
 
+#include <array>
 #include <tuple>
 
 #include "adam/lazy_adam_op.h"
@@ -46,61 +47,6 @@ RankTiles checked_rank_tiles(const char* op, const IntList& begins_and_ends) {
   return ranks;
 }
 
-// The columns of the splats as tensors, in the order in which the op returns them.
-struct SplatTensors {
-  Tensor gaussian_ids, camera_ids, visible_ids, splat_offsets, means2d, conics, depths, opacities, colors,
-      radii, tiles_touched, rank_masks, splat_ids;
-};
-
-template <class T>
-class TorchSplats final : public SplatMemory<T> {
- public:
-  // ids: the persistent ids of the Gaussians, of which there may be none; absent: the ids of the splats are
-  // not wanted.
-  TorchSplats(const Tensor& like, bool with_colors, bool with_masks,
-              const OptionalValues<const std::int64_t>& ids, const std::optional<ProjectSizes>& capacity,
-              SplatTensors* tensors)
-      : like_(like),
-        with_colors_(with_colors),
-        with_masks_(with_masks),
-        ids_(ids),
-        capacity_(capacity),
-        t_(*tensors) {}
-
-  const ProjectSizes* capacity() const override { return capacity_ ? &*capacity_ : nullptr; }
-
-  ProjectColumns<T> allocate(const ProjectSizes& sizes) override {
-    const std::int64_t U = sizes.visible, P = sizes.splats;
-    BLITZGS_CHECK(
-        P <= std::numeric_limits<std::int32_t>::max(), "project_fwd", "", P,
-        " splats (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
-    // The braces guarantee that memory is allocated in this order.
-    using Int = std::int32_t;
-    using Long = std::int64_t;
-    return {{add<Int>(t_.gaussian_ids, {P}), add<Int>(t_.camera_ids, {P}), add<Int>(t_.visible_ids, {U}),
-             add<Int>(t_.splat_offsets, {U + 1})},
-            {add<T>(t_.means2d, {P, 2}), add<T>(t_.conics, {P, 3}), add<T>(t_.depths, {P}),
-             add<T>(t_.opacities, {P}), add<T>(t_.colors, {with_colors_ ? P : 0, 3}),
-             add<Int>(t_.radii, {P, 2}), add<Int>(t_.tiles_touched, {P}),
-             add<Long>(t_.rank_masks, {with_masks_ ? P : 0}).data_if(with_masks_),
-             add<Long>(t_.splat_ids, {ids_.has_value() ? P : 0}).data_if(ids_.has_value()), ids_}};
-  }
-
- private:
-  template <class V>
-  Values<V> add(Tensor& column, const std::vector<std::int64_t>& shape) {
-    const auto values = make<V>(like_, shape);
-    column = values;
-    return values;
-  }
-
-  const Tensor& like_;
-  bool with_colors_, with_masks_;
-  const OptionalValues<const std::int64_t>& ids_;
-  std::optional<ProjectSizes> capacity_;
-  SplatTensors& t_;
-};
-
 std::optional<ProjectSizes> checked_capacity(const char* op, std::optional<std::int64_t> visible,
                                              std::optional<std::int64_t> splats) {
   BLITZGS_CHECK(
@@ -110,8 +56,8 @@ std::optional<ProjectSizes> checked_capacity(const char* op, std::optional<std::
   return ProjectSizes{*visible, *splats};
 }
 
-using Projected = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
-                             Tensor, Tensor, Tensor, Tensor>;
+// The columns of the splats, in the order in which the op returns them, and the totals.
+using Projected = decltype(std::tuple_cat(std::array<Tensor, 13>(), std::tuple<Tensor>()));
 
 Projected project_fwd(const TensorList& gaussians, const Tensor& viewmats, const Tensor& Ks,
                       const OptionalTensor& active_ids, const OptionalTensor& active_views,
@@ -128,7 +74,7 @@ Projected project_fwd(const TensorList& gaussians, const Tensor& viewmats, const
   const std::optional<ProjectSizes> sizes = checked_capacity(kOp, visible_capacity, splat_capacity);
   const auto persistent = checked<std::int64_t>(kOp, "ids", ids, {p.count});
   const auto totals = make<std::int64_t>(p.means, {project_totals(p.n_views, ranks.n_ranks)});
-  SplatTensors t;
+  std::array<Tensor, 13> columns;
   DeviceScope scope(p.means);
   dispatch_floating(p.means, [&]<class T>() {
     ProjectInputs<T> in = p.inputs<T>();
@@ -137,11 +83,31 @@ Projected project_fwd(const TensorList& gaussians, const Tensor& viewmats, const
     in.n_candidates = candidates.count;
     in.n_active = data_or_null<std::int32_t>(candidates.listed);
     in.n_blocks = candidates.blocks;
-    TorchSplats<T> splats(p.means, p.sh.has_value(), ranks.n_ranks > 0, persistent, sizes, &t);
-    backend::project(in, ranks, splats, totals, scope.workspace, scope.stream);
+    const auto memory = [&](const ProjectSizes& needed) -> ProjectColumns<T> {
+      const std::int64_t U = needed.visible, P = needed.splats;
+      BLITZGS_CHECK(
+          P <= std::numeric_limits<std::int32_t>::max(), kOp, "", P,
+          " splats (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
+      const bool with_masks = ranks.n_ranks > 0, with_ids = persistent.has_value();
+      auto next = columns.begin();
+      const auto add = [&](auto zero, const std::vector<std::int64_t>& shape) {
+        const auto values = make<decltype(zero)>(p.means, shape);
+        *next++ = values;
+        return values;
+      };
+      constexpr std::int32_t kInt = 0;
+      constexpr std::int64_t kLong = 0;
+      constexpr T kReal = 0;
+      // The braces guarantee the order of the calls.
+      return {{add(kInt, {P}), add(kInt, {P}), add(kInt, {U}), add(kInt, {U + 1})},
+              {add(kReal, {P, 2}), add(kReal, {P, 3}), add(kReal, {P}), add(kReal, {P}),
+               add(kReal, {p.sh ? P : 0, 3}), add(kInt, {P, 2}), add(kInt, {P}),
+               add(kLong, {with_masks ? P : 0}).data_if(with_masks),
+               add(kLong, {with_ids ? P : 0}).data_if(with_ids), persistent}};
+    };
+    backend::project<T>(in, ranks, sizes ? &*sizes : nullptr, memory, totals, scope.workspace, scope.stream);
   });
-  return {t.gaussian_ids, t.camera_ids, t.visible_ids, t.splat_offsets, t.means2d,    t.conics,    t.depths,
-          t.opacities,    t.colors,     t.radii,       t.tiles_touched, t.rank_masks, t.splat_ids, totals};
+  return std::tuple_cat(columns, std::tuple<Tensor>(totals));
 }
 
 class HeldSplatGradients {

@@ -44,14 +44,13 @@ struct World {
   }
 };
 
-struct Projected final : SplatMemory<double> {
+struct Projected {
   ProjectSizes sizes{};
   std::vector<std::int64_t> totals, rank_masks;
   std::vector<std::int32_t> gaussian_ids, camera_ids, visible_ids, splat_offsets, radii, tiles;
   std::vector<double> means2d, conics, depths, opacities, colors;
 
-  const ProjectSizes* capacity() const override { return nullptr; }
-  ProjectColumns<double> allocate(const ProjectSizes& counted) override {
+  ProjectColumns<double> allocate(const ProjectSizes& counted) {
     sizes = counted;
     const std::size_t U = sizes.visible, P = sizes.splats;
     const auto sized = [](auto& values, std::size_t size) {
@@ -69,7 +68,9 @@ Projected project(const ProjectInputs<double>& in, const RankTiles& ranks = {}) 
   Projected p;
   TestWorkspace workspace;
   p.totals.resize(project_totals(in.n_views, ranks.n_ranks));
-  cpu::project(in, ranks, p, p.totals.data(), workspace, nullptr);
+  cpu::project<double>(
+      in, ranks, nullptr, [&](const ProjectSizes& sizes) { return p.allocate(sizes); }, p.totals.data(),
+      workspace, nullptr);
   return p;
 }
 

@@ -280,8 +280,7 @@ void write_splats(const Inputs& in, const RankTiles& rank_tiles, const Prefilter
   }
   const int at_once = projected_at_once(in.n_views);
   const std::int64_t turns = std::max<std::int64_t>(1, (in.n_candidates + at_once - 1) / at_once);
-  const std::int64_t blocks = std::min<std::int64_t>(1 + turns, kBlocksPerMultiprocessor * multiprocessors());
-  splats_kernel<<<static_cast<unsigned>(blocks), kSplatThreads, 0, stream>>>(
+  splats_kernel<<<resident_blocks(1 + turns, 1, kBlocksPerMultiprocessor), kSplatThreads, 0, stream>>>(
       in, rank_tiles, kept, capacity, ids, columns.values, reinterpret_cast<unsigned long long*>(totals),
       TurnSums(turn_zeros(turns, workspace, stream)));
   check_launch("project");

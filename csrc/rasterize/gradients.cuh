@@ -205,13 +205,10 @@ inline EntriesBySplat sort_entries(const std::int32_t* isect_splats, std::int64_
   auto* order = workspace.allocate<std::int32_t>(n);
   iota_kernel<<<blocks_for(n, 256), 256, 0, stream>>>(order, n);
   check_launch("rasterize_bwd");
-  std::size_t bytes = 0;
-  const auto sort = [&](void* scratch) {  // null: sets the bytes of scratch memory that it needs
+  run_cub("rasterize_bwd", workspace, [&](void* scratch, std::size_t& bytes) {
     return cub::DeviceRadixSort::SortPairs(scratch, bytes, isect_splats, sorted.splats, order, sorted.entries,
                                            n, 0, bits, stream);
-  };
-  check(sort(nullptr), "rasterize_bwd");
-  check(sort(workspace.allocate_bytes(bytes)), "rasterize_bwd");
+  });
   return sorted;
 }
 

@@ -152,7 +152,7 @@ struct Tile {
   static constexpr int kWarps = kThreads / 32;
   static constexpr int kColumns = kTileSize / kSubtile;
   static constexpr int kSubtiles = kColumns * kColumns;
-  static constexpr int kMaskWords = (kSubtiles + 31) / 32;
+  static_assert(kSubtiles <= 32);  // the bits of a word
 };
 
 // The position of a thread's pixel.
@@ -209,11 +209,10 @@ __device__ __forceinline__ std::uint32_t ceil_bits(float scale, float value, flo
   return __float_as_uint(__fmaf_ru(scale, value, shift + 12582912.f));
 }
 
-// Sets one bit per subtile, row by row: whether alpha may reach 1/255 at one of the subtile's pixel centres.
-// The points with alpha >= 1/255 form an ellipse. Its part in a row of subtiles spans an interval of x whose
-// ends have a closed form (as in math/tiles.h).
-__device__ __forceinline__ void subtile_mask(const PackedSplat& splat, const TilePlace& place,
-                                             std::uint32_t* masks) {
+// Returns one bit per subtile, row by row: whether alpha may reach 1/255 at one of the subtile's pixel
+// centres. The points with alpha >= 1/255 form an ellipse. Its part in a row of subtiles spans an interval of
+// x whose ends have a closed form (as in math/tiles.h).
+__device__ __forceinline__ std::uint32_t subtile_mask(const PackedSplat& splat, const TilePlace& place) {
   constexpr int kColumns = Tile::kColumns;
   constexpr std::uint32_t kRow = (1u << kColumns) - 1u;
   // From the centre of the tile's first pixel to the mean.
@@ -226,8 +225,7 @@ __device__ __forceinline__ void subtile_mask(const PackedSplat& splat, const Til
   const float inverse = 1.000003f * reciprocal_approx(splat.l11);
   const float turn = splat.turn * sqrt_approx(cut);
   const float left = x - slack - (kSubtile - 1), right = x + slack;
-#pragma unroll
-  for (int word = 0; word < Tile::kMaskWords; ++word) masks[word] = 0;
+  std::uint32_t mask = 0;
 #pragma unroll
   for (int i = 0; i < kColumns; ++i) {
     const float y0 = static_cast<float>(i * kSubtile) - y, y1 = y0 + (kSubtile - 1);
@@ -244,23 +242,9 @@ __device__ __forceinline__ void subtile_mask(const PackedSplat& splat, const Til
     const std::uint32_t skip_right =
         ceil_bits(-0.25f, fmaxf(fminf(end_right, static_cast<float>(kTileSize - 1)), -4.f), kColumns - 1.f);
     const std::uint32_t bits = __funnelshift_l(0u, kRow, skip_left) & __funnelshift_r(kRow, 0u, skip_right);
-    if (rest_right >= 0.f) masks[i * kColumns / 32] |= bits << (i * kColumns % 32);
+    if (rest_right >= 0.f) mask |= bits << i * kColumns;
   }
-}
-
-// Transposes the 32 x 32 bits of a warp: bit r of the result of lane c is bit c of the argument of lane r.
-__device__ __forceinline__ std::uint32_t transpose_bits(std::uint32_t bits, int lane) {
-  constexpr std::uint32_t kLow[5] = {0x55555555u, 0x33333333u, 0x0f0f0f0fu, 0x00ff00ffu, 0x0000ffffu};
-#pragma unroll
-  for (int i = 4; i >= 0; --i) {
-    const int step = 1 << i;
-    const bool high = lane & step;
-    const std::uint32_t other = __shfl_xor_sync(kFullWarp, bits, step);
-    const std::uint32_t keep = high ? ~kLow[i] : kLow[i];
-    const std::uint32_t moved = __funnelshift_l(other, other, high ? 32 - step : step);
-    bits = (bits & keep) | (moved & ~keep);
-  }
-  return bits;
+  return mask;
 }
 
 // A list entry in shared memory. The first six numbers are the splat relative to the tile's centre, for
@@ -325,7 +309,7 @@ struct EntryBatch {
   __device__ __forceinline__ void place(int buffer, bool present, const TilePlace& tile, int at) {
     const int lane = at & 31;
     copies_done();
-    std::uint32_t masks[Tile::kMaskWords] = {};
+    std::uint32_t mask = 0;
     if (present) {
       auto* target = reinterpret_cast<float4*>(&entries[buffer][at]);
       const float4 a = target[0], b = target[1];
@@ -333,13 +317,10 @@ struct EntryBatch {
       const float y = a.y - static_cast<float>(tile.top + kTileSize / 2);
       target[0] = {a.z, a.w, -__fmaf_rn(a.z, x, __fmul_rn(a.w, y)), b.x};
       target[1] = {-__fmul_rn(b.x, y), b.y, a.x, a.y};
-      subtile_mask({a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w}, tile, masks);
+      mask = subtile_mask({a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w}, tile);
     }
-#pragma unroll
-    for (int i = 0; i < Tile::kMaskWords; ++i) {
-      const std::uint32_t mine = transpose_bits(masks[i], lane);
-      if (32 * i + lane < Tile::kSubtiles) hits[buffer][32 * i + lane][at >> 5] = mine;
-    }
+    mask = transpose_bits(mask, lane);
+    if (lane < Tile::kSubtiles) hits[buffer][lane][at >> 5] = mask;
   }
 
   // Writes the subtile's list from the batch's first `limit` entries, in reverse order if BACKWARDS. Returns

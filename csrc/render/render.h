@@ -2,7 +2,6 @@
 // What a call needs beyond the projection (project.h), intersect (intersect.h) and rasterize_fwd
 // (rasterize.h): rows of the visible Gaussians, alphas, and splats in the arrangement of `meta`.
 #pragma once
-#include <array>
 #include <cstdint>
 
 #include "common/kernel.h"
@@ -44,28 +43,24 @@ struct GatherRows {
 };
 
 // A call with SH gathers the rows of the visible Gaussians of a projection (project.h) into a small table,
-// row u for the Gaussian visible_ids[u]. This op writes the numbers that lead from rows and splats to each
-// other:
-//   rows[u] = u;   indices[u] = visible_ids[u];
-//   row_of_splat[i] = u for the splats i of this Gaussian, splat_offsets[u] <= i < splat_offsets[u + 1].
-// On CUDA nothing is written if there are more splats than the capacity. On the CPU the sizes of the capacity
-// are the actual numbers.
-
+// row u for the Gaussian visible_ids[u]. This writes the numbers that lead from rows and splats to each
+// other; nothing, if there are more splats than the capacity.
 struct NumberedRows {
+  ProjectCapacity capacity;
   const std::int32_t* visible_ids;    // [U]
   const std::int32_t* splat_offsets;  // [U + 1]
   std::int32_t* rows;                 // [U]
   std::int64_t* indices;              // [U]
   std::int32_t* row_of_splat;         // [P]
-};
+  std::int64_t n;                     // U of the capacity
 
-BLITZGS_HD void number_row(const NumberedRows& numbered, std::int32_t u) {
-  numbered.rows[u] = u;
-  numbered.indices[u] = numbered.visible_ids[u];
-  for (std::int32_t i = numbered.splat_offsets[u]; i < numbered.splat_offsets[u + 1]; ++i) {
-    numbered.row_of_splat[i] = u;
+  BLITZGS_HD void operator()(std::int64_t u) const {
+    if (u >= capacity.fitting().visible) return;
+    rows[u] = static_cast<std::int32_t>(u);
+    indices[u] = visible_ids[u];
+    for (std::int32_t i = splat_offsets[u]; i < splat_offsets[u + 1]; ++i) row_of_splat[i] = rows[u];
   }
-}
+};
 
 // Copies rows of several columns at once between the order of the splats and the arrangement in which
 // `blitzgs.rasterization` returns them: its third result, the dictionary `meta` of gsplat's interface
@@ -88,31 +83,37 @@ struct ArrangeSplats {
   const std::int64_t* order;
   const std::int32_t *images, *gaussians;
   std::int64_t n, count;
+  bool back;  // from the arrangement to the order of the splats
   int n_columns;
-  std::array<ArrangedColumn, kMaxArranged> columns;
+  ArrangedColumn columns[kMaxArranged];
 
-  BLITZGS_HD std::int64_t splat(std::int64_t i) const { return order ? order[i] : i; }
-  BLITZGS_HD std::int64_t entry(std::int64_t i) const { return order ? i : images[i] * count + gaussians[i]; }
+  BLITZGS_HD void operator()(std::int64_t i) const {
+    const std::int64_t splat = order ? order[i] : i, entry = order ? i : images[i] * count + gaussians[i];
+    for (int c = 0; c < n_columns; ++c) {
+      const ArrangedColumn& column = columns[c];
+      const std::uint32_t* from = column.from + (back ? entry : splat) * column.stride;
+      std::uint32_t* to = column.to + (back ? splat : entry) * column.words;
+      for (std::int64_t k = 0; k < column.words; ++k) to[k] = from[k];
+    }
+  }
 };
 
-// The entries [entries] of a column before its splats are copied: entries without a splat keep this value,
-// which is zero or, with `under` [scenes, count], that of their Gaussian. An image is one of `views` images
-// of its scene.
-struct EmptyEntries {
-  ArrangedColumn column;
-  std::int64_t entries, count, views;
+// Gives the entries of a column, before its splats are copied, the values `under` [scenes, count] of their
+// Gaussians, which those without a splat keep. An image is one of `views` images of its scene.
+struct UnderSplats {
   const std::uint32_t* under;
+  std::uint32_t* to;
+  std::int64_t n, words, count, views;
 
-  BLITZGS_HD std::int64_t source(std::int64_t entry) const {
-    return entry / (views * count) * count + entry % count;
+  BLITZGS_HD void operator()(std::int64_t i) const {
+    const std::int64_t source = i / (views * count) * count + i % count;
+    for (std::int64_t k = 0; k < words; ++k) to[i * words + k] = under[source * words + k];
   }
 };
 
 namespace BLITZGS_BACKEND {
 void gather_rows(const GatherRows&, CudaStream);
-void number_rows(const NumberedRows&, const ProjectCapacity&, CudaStream);
-void fill_entries(const EmptyEntries&, CudaStream);
-void arrange_splats(const ArrangeSplats&, bool back, CudaStream);
+void zero_words(std::uint32_t* words, std::int64_t n, CudaStream);
 }  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "common/cuda.cuh"
 #include "common/rows.h"
-#include "project/project_device.cuh"
 #include "render/render.h"
 
 namespace blitzgs::cuda {
@@ -33,35 +32,6 @@ __global__ void __launch_bounds__(kThreads) gather_rows_kernel(const __grid_cons
   }
 }
 
-// One thread per row.
-__global__ void __launch_bounds__(kThreads)
-    number_rows_kernel(const NumberedRows numbered, const ProjectCapacity capacity) {
-  const std::int64_t u = blockIdx.x * std::int64_t{kThreads} + threadIdx.x;
-  if (u < fitting(capacity).visible) number_row(numbered, static_cast<std::int32_t>(u));
-}
-
-// One thread per entry.
-__global__ void __launch_bounds__(kThreads) fill_entries_kernel(const EmptyEntries fill) {
-  const std::int64_t i = blockIdx.x * std::int64_t{kThreads} + threadIdx.x;
-  if (i >= fill.entries) return;
-  const std::int64_t words = fill.column.words, source = fill.source(i);
-  for (std::int64_t k = 0; k < words; ++k) fill.column.to[i * words + k] = fill.under[source * words + k];
-}
-
-// One thread per splat, which copies its row of every column.
-__global__ void __launch_bounds__(kThreads) arrange_splats_kernel(const ArrangeSplats moves, bool back) {
-  const std::int64_t i = blockIdx.x * std::int64_t{kThreads} + threadIdx.x;
-  if (i >= moves.n) return;
-  const std::int64_t splat = moves.splat(i), entry = moves.entry(i);
-  const std::int64_t from = back ? entry : splat, to = back ? splat : entry;
-  for (int c = 0; c < moves.n_columns; ++c) {
-    const ArrangedColumn& column = moves.columns[c];
-    const std::uint32_t* source = column.from + from * column.stride;
-    std::uint32_t* target = column.to + to * column.words;
-    for (std::int64_t k = 0; k < column.words; ++k) target[k] = source[k];
-  }
-}
-
 }  // namespace
 
 void gather_rows(const GatherRows& gather, CudaStream stream) {
@@ -71,31 +41,14 @@ void gather_rows(const GatherRows& gather, CudaStream stream) {
   check_launch("gather_rows");
 }
 
-void number_rows(const NumberedRows& numbered, const ProjectCapacity& capacity, CudaStream stream) {
-  if (capacity.sizes.visible == 0) return;
-  number_rows_kernel<<<blocks_for(capacity.sizes.visible, kThreads), kThreads, 0, stream>>>(numbered,
-                                                                                            capacity);
-  check_launch("color_rows");
+void zero_words(std::uint32_t* words, std::int64_t n, CudaStream stream) {
+  if (n == 0) return;
+  check(cudaMemsetAsync(words, 0, static_cast<std::size_t>(n) * sizeof(*words), stream), "arrange_splats");
 }
 
-void fill_entries(const EmptyEntries& fill, CudaStream stream) {
-  const std::int64_t words = fill.entries * fill.column.words;
-  if (words == 0) return;
-  if (!fill.under) {
-    check(cudaMemsetAsync(fill.column.to, 0, static_cast<std::size_t>(words) * sizeof(std::uint32_t), stream),
-          "fill_entries");
-    return;
-  }
-  fill_entries_kernel<<<blocks_for(fill.entries, kThreads), kThreads, 0, stream>>>(fill);
-  check_launch("fill_entries");
-}
-
-void arrange_splats(const ArrangeSplats& moves, bool back, CudaStream stream) {
-  if (moves.n == 0 || moves.n_columns == 0) return;
-  arrange_splats_kernel<<<blocks_for(moves.n, kThreads), kThreads, 0, stream>>>(moves, back);
-  check_launch("arrange_splats");
-}
-
+template void for_each_row(const NumberedRows&, CudaStream);
+template void for_each_row(const ArrangeSplats&, CudaStream);
+template void for_each_row(const UnderSplats&, CudaStream);
 template void for_each_row(const Alphas<float>&, CudaStream);
 
 }  // namespace blitzgs::cuda

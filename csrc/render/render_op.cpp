@@ -145,7 +145,8 @@ TensorList color_rows(const TensorList& gaussians, const TensorList& sh, const T
   const Tensor colors = make_empty(p.means, {p.sh ? P : 0, 3});
   DeviceScope scope(p.means);
   auto* row_of_splat = scope.workspace.allocate<std::int32_t>(P);
-  backend::number_rows({visible_ids, offsets, numbers, indices, row_of_splat}, capacity, scope.stream);
+  backend::for_each_row(NumberedRows{capacity, visible_ids, offsets, numbers, indices, row_of_splat, U},
+                        scope.stream);
   if (p.sh) {
     dispatch_floating(p.means, [&]<class T>() {
       ProjectColumns<T> columns{};
@@ -306,12 +307,16 @@ std::vector<Tensor> arrange_splats(const std::vector<Tensor>& columns, const std
   }
   DeviceScope scope(columns[0]);
   for (int c = 0; places.has_empty_entries() && c < places.moves.n_columns; ++c) {
-    const bool over = below && c == places.moves.n_columns - 1;
-    backend::fill_entries({places.moves.columns[c], places.entries(), places.moves.count, views,
-                           over ? static_cast<const std::uint32_t*>(below->const_data_ptr()) : nullptr},
-                          scope.stream);
+    const auto& [from, to, words, stride] = places.moves.columns[c];
+    if (below && c == places.moves.n_columns - 1) {
+      const auto* values = static_cast<const std::uint32_t*>(below->const_data_ptr());
+      backend::for_each_row(UnderSplats{values, to, places.entries(), words, places.moves.count, views},
+                            scope.stream);
+    } else {
+      backend::zero_words(to, places.entries() * words, scope.stream);
+    }
   }
-  backend::arrange_splats(places.moves, /*back=*/false, scope.stream);
+  backend::for_each_row(places.moves, scope.stream);
   return arranged;
 }
 
@@ -331,7 +336,8 @@ std::vector<Tensor> splats_of_arranged(const std::vector<Tensor>& arranged,
   }
   std::vector<Tensor> splats = make_targets(arranged, shape.size(), {places.moves.n}, held, places.moves);
   DeviceScope scope(arranged[0]);
-  backend::arrange_splats(places.moves, /*back=*/true, scope.stream);
+  places.moves.back = true;
+  backend::for_each_row(places.moves, scope.stream);
   return splats;
 }
 
