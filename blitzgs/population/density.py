@@ -11,8 +11,8 @@ from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.selection import smallest
+from blitzgs.ops.blocks import take_rows
 from blitzgs.ops.counter_random import hash_keys, normal
-from blitzgs.ops.rows import take_rows
 from blitzgs.optim.table_adam import Pending
 from blitzgs.spawn.candidates import Candidates, Veto, spawn_features
 from blitzgs.spawn.lineage import Births, Cause, Lineage
