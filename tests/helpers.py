@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small scenes and models, a reader of GLB, and error measures that fail for NaN and wrong shapes."""
+"""Small scenes and models, gradients, a reader of GLB, and errors that fail for NaN and wrong shapes."""
 
 from __future__ import annotations
 
