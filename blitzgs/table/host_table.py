@@ -14,8 +14,7 @@ from torch import Tensor
 
 from blitzgs.ops.blocks import take_rows
 from blitzgs.table.table import GROWTH, GaussianTable
-from blitzgs.util.errors import UserError
-from blitzgs.util.terminal import amount
+from blitzgs.util.errors import UserError, amount
 
 
 class HostMemoryError(UserError):

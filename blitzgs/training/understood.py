@@ -17,8 +17,7 @@ from blitzgs.config.schedule import Schedule, stretched
 from blitzgs.population.density import growth_limit
 from blitzgs.training.inputs import sharing_hint
 from blitzgs.training.state import TrainingState
-from blitzgs.util.errors import warn
-from blitzgs.util.terminal import printable
+from blitzgs.util.errors import printable, warn
 
 # Photographs that are decoded before the training, and views that are compared with the points.
 _DECODED, _PROJECTED = 16, 100
