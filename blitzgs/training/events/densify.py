@@ -20,11 +20,11 @@ from blitzgs.population.density import (
     growth_limit,
     memory_limit,
 )
-from blitzgs.population.redistribution import MAX_IMBALANCE, redistribute
 from blitzgs.population.relocation import relocate
 from blitzgs.runs.guard import ModelLostError, check_table
 from blitzgs.table.blocks import sort_rows, spread
 from blitzgs.table.host_table import HostTable
+from blitzgs.table.placement import MAX_IMBALANCE, redistribute
 from blitzgs.table.table import PARAMETERS
 from blitzgs.training.state import TrainingState
 
