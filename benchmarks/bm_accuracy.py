@@ -29,11 +29,12 @@ from functools import cache
 from pathlib import Path
 
 import torch
-from gradients import parameter_gradients
 from harness import make_parser, stage_medians, write_json
 from report_tables import accuracy_lines
 from scenes import BenchmarkScene, aerial
 from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.render import Frame, RenderOptions, render_frame
@@ -44,6 +45,7 @@ from blitzgs.ops.intersect import tile_counts
 from blitzgs.ops.projection_types import Views
 from blitzgs.reference import Composite, Splats, composite, project_splats
 from blitzgs.table.table import PARAMETERS, GaussianTable, schema
+from tests.helpers import parameter_gradients
 
 IMAGE_BOUND, GRADIENT_BOUND = 2e-5, 1e-4  # largest errors of the default setting
 

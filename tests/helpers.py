@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small scenes and models, a reader of GLB, and error measures that fail for NaN and wrong shapes."""
+"""Small scenes and models, gradients, a reader of GLB, and errors that fail for NaN and wrong shapes."""
 
 from __future__ import annotations
 
@@ -18,15 +18,17 @@ import torch
 from torch import Tensor
 
 import blitzgs
-from benchmarks.gradients import parameter_gradients as parameter_gradients
 from blitzgs.formats.gaussians import Gaussians
 from blitzgs.formats.models import FORMATS
+from blitzgs.frame.render import Frame, backward_splats
 from blitzgs.ops.photometric import report_
+from blitzgs.ops.projection_types import WeightedViews
 from blitzgs.reference import ReferenceImage, render
 from blitzgs.runs.checkpoint import Saving
 from blitzgs.runs.export import Exported, export
 from blitzgs.runs.folder import Model
 from blitzgs.runs.source import source_of
+from blitzgs.table.table import GaussianTable
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors", "viewmats")
 
@@ -322,3 +324,20 @@ def read_glb(path):
             values = values / np.iinfo(dtype).max
         attributes[name] = values
     return content, attributes
+
+
+def parameter_gradients(
+    table: GaussianTable, frame: Frame, v_renders: Tensor, *weights: Tensor | None
+) -> list[Tensor]:
+    """Return the gradients of the U visible Gaussians' parameters, from those of a frame's images.
+
+    Training never stores them. `weights`: of regularisers, as those of `WeightedViews`.
+    """
+    gradients, projected = backward_splats(frame, v_renders), frame.projected
+    options = frame.options.projection(frame.views)
+    *parameters, _ = torch.ops.blitzgs.project_bwd(
+        list(table.parameters), *WeightedViews(frame.views.viewmats, frame.views.Ks, *weights),
+        projected.camera_ids, projected.visible_ids, projected.splat_offsets, None, *options,
+        list(gradients.parts), None, False,
+    )  # fmt: skip
+    return parameters

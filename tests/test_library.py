@@ -49,20 +49,19 @@ def test_a_library_that_was_not_rebuilt_is_named(tmp_path, monkeypatch):
     refused(ImportError, message, _library.load_libraries)
 
 
-def test_a_library_that_is_missing_is_named(tmp_path):
+def test_the_folder_of_the_libraries_is_that_of_the_environment(tmp_path):
     environment = os.environ | {"BLITZGS_LIBRARY_DIR": str(tmp_path)}
-    command = [sys.executable, "-c", "import blitzgs.ops.population"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    assert done.returncode != 0
-    assert f"{tmp_path}/libblitzgs_cpu.so is missing: the kernels are not built" in done.stderr
+    command = [sys.executable, "-c", "from blitzgs._built import LIBRARY_DIR; print(LIBRARY_DIR)"]
+    assert subprocess.check_output(command, env=environment, text=True) == f"{tmp_path}\n"
 
 
 def test_missing_cuda_kernels_name_both_remedies(tmp_path, monkeypatch):
     monkeypatch.setattr(_library, "LIBRARY_DIR", tmp_path)
     with pytest.raises(ImportError, match=r"with nvcc .* or hide the GPUs \(CUDA_VISIBLE_DEVICES=\)"):
         _library._load(tmp_path / "libblitzgs_cuda.so")
-    with pytest.raises(ImportError) as caught:
-        _library._load(tmp_path / "libblitzgs_cpu.so")
+    message = f"{tmp_path}/libblitzgs_cpu.so is missing: the kernels are not built. Run `pip install .`"
+    with pytest.raises(ImportError, match=re.escape(message)) as caught:
+        _library.load_libraries()
     assert "nvcc" not in str(caught.value)
 
 
@@ -71,40 +70,29 @@ IMPORT = re.compile(r"^from (blitzgs[\w.]*) import ([\w, ]+)", re.MULTILINE)
 
 LISTED = Path(__file__).with_name("public_names.txt")
 CODE = """
+import contextlib
+import os
 import sys
+before = dict(os.environ)
 import blitzgs
 assert "torch" not in sys.modules and "blitzgs._library" not in sys.modules
+assert dict(os.environ) == before
+import cv2
+import torch
+before = dict(os.environ)  # torch and cv2 may set variables of their own
 for name in blitzgs.__all__:
     assert getattr(blitzgs, name) is not None
 assert issubclass(blitzgs.optim.LazyAdam, object)
+assert dict(os.environ) == before, set(os.environ.items()) ^ set(before.items())
 
-import contextlib
-import torch
 from blitzgs.distributed.shared_memory import symmetric_words
 with contextlib.suppress(RuntimeError):  # torch has no such memory on the CPU
     symmetric_words(8, torch.int64, torch.device("cpu"))
 assert "sympy" not in sys.modules  # it takes seconds
 """
 
-ENVIRONMENT = """
-import os
-before = dict(os.environ)
-import blitzgs
-assert dict(os.environ) == before
-import cv2
-import torch
-before = dict(os.environ)  # torch and cv2 may set variables of their own
-for name in blitzgs.__all__:
-    getattr(blitzgs, name)
-assert dict(os.environ) == before, set(os.environ.items()) ^ set(before.items())
-"""
 
-
-def test_import_changes_no_environment_variable():
-    subprocess.run([sys.executable, "-c", ENVIRONMENT], check=True)
-
-
-def test_public_names_are_loaded_when_they_are_asked_for():
+def test_names_are_loaded_when_they_are_asked_for_and_change_no_environment_variable():
     subprocess.run([sys.executable, "-c", CODE], check=True)
 
 

@@ -29,7 +29,7 @@ from blitzgs.call.channels import ImageOptions, background_rows
 from blitzgs.call.groups import ShTables, gathered_groups, groups_may_be_queued, groups_of
 from blitzgs.call.images import render
 from blitzgs.call.rasterize import rasterization
-from blitzgs.ops.rows import of_shape
+from blitzgs.ops.derivatives import of_shape
 
 
 class CatchesUp(Protocol):

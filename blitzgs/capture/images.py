@@ -46,8 +46,7 @@ from blitzgs.capture.image_files import (
 from blitzgs.capture.masks import FileCheck, misfit
 from blitzgs.capture.shared_images import SharedImages
 from blitzgs.formats import native
-from blitzgs.util.errors import UserError, located
-from blitzgs.util.terminal import amount
+from blitzgs.util.errors import UserError, amount, located
 
 K = TypeVar("K")
 V = TypeVar("V")

@@ -23,7 +23,8 @@ from typing import cast
 
 from blitzgs import __version__
 from blitzgs.cli.arguments import HelpFormatter, Parser, check_given_once, flag_meant, split_fields
-from blitzgs.util.terminal import Output, printable, surviving_output
+from blitzgs.cli.output import report_lost, surviving_output
+from blitzgs.util.errors import UserError, printable
 
 HELP = """\
 Train 3D Gaussian Splatting models of photographs: models of a desk, or of a whole city.
@@ -74,8 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             status = _run(given)
         except SystemExit as ending:  # argparse's, after a help or a wrong usage
-            raise SystemExit(_report_lost(given, outputs) or ending.code) from None
-        return _report_lost(given, outputs) or status
+            raise SystemExit(report_lost(given, outputs) or ending.code) from None
+        return report_lost(given, outputs) or status
 
 
 def _run(given: list[str]) -> int:
@@ -100,8 +101,6 @@ def _run(given: list[str]) -> int:
         return 130
     except Exception as error:
         from rich.console import Console
-
-        from blitzgs.util.errors import UserError
 
         # Any other error is a fault of the program and keeps its traceback.
         if not isinstance(error, (ValueError, OSError, ImportError, MemoryError, UserError)):
@@ -189,29 +188,3 @@ def _message(error: BaseException) -> str:
         file = next((part for part in (path, *path.parents) if part.exists() and not part.is_dir()), path)
         return f"{file} is a file where a folder is needed: choose another name"
     return f"{error.filename}: {error.strerror}"
-
-
-# Commands whose result is what they print.
-_PRINTING = (
-    "eval", "completion", "--json", "--show-config", "--check", "--help", "--help-fields", "-h", "--version"
-)  # fmt: skip
-
-
-def _report_lost(given: list[str], outputs: dict[str, Output]) -> int:
-    """Say that a part of the output was lost; return 1 if it was the result of the command, else 0.
-
-    A reader that closes its end, as `head` does, wants no more: this is no failure.
-    """
-    for name in outputs:
-        getattr(sys, name).flush()
-    lost = [output for output in outputs.values() if output.lost and output.has_reader]
-    for output in lost:
-        print(
-            f"blitzgs: {output.title} cannot be written ({output.lost}): what was printed there is "
-            "incomplete; files are complete",
-            file=sys.stderr,
-        )
-    return int(
-        any(output.title == "standard output" for output in lost)
-        and any(text.partition("=")[0] in _PRINTING for text in given)
-    )

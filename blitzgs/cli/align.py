@@ -25,8 +25,7 @@ from blitzgs.config.files import load_config
 from blitzgs.runs import run_files
 from blitzgs.runs.world import load_world_frame, save_world_frame
 from blitzgs.training.inputs import load_configured
-from blitzgs.util.errors import warn
-from blitzgs.util.terminal import printable
+from blitzgs.util.errors import printable, warn
 
 # -1 for photographs that look straight down, or level; -1.4 between the two.
 _TURNED_OVER = 0.3

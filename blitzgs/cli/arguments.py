@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from blitzgs.config.ranges import RANGES
-from blitzgs.util.terminal import printable
+from blitzgs.util.errors import printable
 
 if TYPE_CHECKING:
     from blitzgs.capture.capture import Capture

@@ -21,8 +21,8 @@ from blitzgs.runs.evaluation import evaluate, load_lpips, worst_views
 from blitzgs.runs.world import check_seen, subject_of_file
 from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.training.understood import largest_size
+from blitzgs.util.errors import printable
 from blitzgs.util.progress import image_progress
-from blitzgs.util.terminal import printable
 from blitzgs.view.views import Space, ViewSet
 
 HELP = """\

@@ -10,8 +10,7 @@ from pathlib import Path
 
 from blitzgs.cli.arguments import Commands, add_command, add_flags, add_path, add_run
 from blitzgs.runs import run_files
-from blitzgs.util.errors import warn
-from blitzgs.util.terminal import printable
+from blitzgs.util.errors import printable, warn
 
 HELP = """\
 Write the report of a run as one HTML file that needs no network: metrics of each held-out view, best and

@@ -19,7 +19,7 @@ from blitzgs.runs.run_files import CONFIG
 from blitzgs.sfm.photographs import Photographs, estimate, has_photographs_alone, photograph_folder
 from blitzgs.sfm.reconstruct import MAPPERS, PAIRS, WORK, Settings, is_finished, reconstruct
 from blitzgs.sfm.refine import refine
-from blitzgs.util.terminal import printable
+from blitzgs.util.errors import printable
 
 HELP = """\
 Find out where photographs were taken from, and write a capture that blitzgs train --data reads.

@@ -35,10 +35,9 @@ from blitzgs.training.inputs import open_capture, read_ahead
 from blitzgs.training.state import TrainingState
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.understood import check_worlds, estimate, understood
-from blitzgs.util.errors import kept_warnings
+from blitzgs.util.errors import kept_warnings, printable
 from blitzgs.util.output import check_outside
 from blitzgs.util.progress import Laps
-from blitzgs.util.terminal import printable
 
 if TYPE_CHECKING:
     from blitzgs.viewer.live import Live

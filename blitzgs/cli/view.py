@@ -21,7 +21,7 @@ from blitzgs.formats.streamed_sog import META
 from blitzgs.formats.tiles import PAGE, TILESET
 from blitzgs.runs import run_files
 from blitzgs.training.inputs import open_capture
-from blitzgs.util.terminal import printable
+from blitzgs.util.errors import printable
 from blitzgs.viewer.door import is_loopback, unheard
 
 HELP = """\

@@ -7,13 +7,15 @@ not follow this project's style. docs/guide/migration.md lists what differs.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from blitzgs.call.covariances import Decomposed, decompose, shaped_by
 from blitzgs.call.gaussians import l1_ssim
+from blitzgs.ops.derivatives import first_only, linear_map
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.project import differentiable_splats, gaussian_tensors
@@ -123,9 +125,7 @@ class GaussianRasterizer(torch.nn.Module):
         if means2D is not None or means2D_densify is not None:
             half = means3D.new_tensor([width / 2, height / 2])
             ids = splats.gaussian_ids.long()
-            means2d = _ScreenGradients.apply(  # type: ignore[no-untyped-call]
-                means2d, means2D, means2D_densify, ids, half, absolute
-            )
+            means2d = _with_gradients_of(means2d, (means2D, means2D_densify), ids, half, absolute)
         if colors_precomp is None:
             channels = splats.colors
         else:
@@ -301,35 +301,33 @@ def _radii(splats: ProjectedSplats, count: int) -> Tensor:
     return radii.index_copy_(0, splats.gaussian_ids.long(), values)
 
 
-class _ScreenGradients(torch.autograd.Function):
-    """Passes projected means through, and their gradient also to `means2D`, in half images."""
+def _with_gradients_of(
+    means2d: Tensor, screen: Sequence[Tensor | None], ids: Tensor, half: Tensor, absolute: list[Tensor]
+) -> Tensor:
+    """Return projected means whose gradient is also that of the tensors `screen`, in half images.
 
-    @staticmethod
-    def forward(
-        ctx: Any,
-        means2d: Tensor,
-        screen: Tensor | None,
-        densify: Tensor | None,
-        ids: Tensor,
-        half: Tensor,
-        absolute: list[Tensor],
-    ) -> Tensor:
-        ctx.save_for_backward(ids, half)
-        ctx.shapes = [None if tensor is None else tensor.shape for tensor in (screen, densify)]
-        ctx.absolute = absolute
-        return means2d.clone()
+    The first of `screen` gets the gradient; the second what the rasteriser's backward pass, which comes
+    before, puts into `absolute`.
+    """
+    shapes = [None if tensor is None else tensor.shape for tensor in screen]
 
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, v_means2d: Tensor) -> Any:
-        ids, half = ctx.saved_tensors
-        # The rasteriser's backward pass, which comes before, has told the absolute gradients.
-        found = (v_means2d, ctx.absolute.pop() if ctx.absolute else v_means2d.abs())
-        gradients = []
-        for gradient, shape in zip(found, ctx.shapes, strict=True):
-            spread = None
-            if shape is not None:
-                spread = gradient.new_zeros(shape)
-                spread[:, :2].index_copy_(0, ids, gradient * half)
-            gradients.append(spread)
-        return v_means2d, *gradients, None, None, None
+    def back(
+        saved: Sequence[Tensor], needed: Sequence[bool], v: Sequence[Tensor | None]
+    ) -> list[Tensor | None]:
+        (ids, half), v_means2d = saved, v[0]
+        assert v_means2d is not None  # the only output
+        found = (v_means2d, absolute.pop() if absolute else v_means2d.abs())
+
+        def spread() -> list[Tensor | None]:
+            gradients: list[Tensor | None] = [None, None]
+            for i, (shape, gradient) in enumerate(zip(shapes, found, strict=True)):
+                if shape is not None and needed[1 + i]:
+                    whole = gradient.new_zeros(shape)
+                    whole[:, :2].index_copy_(0, ids, gradient * half)
+                    gradients[i] = whole
+            return gradients
+
+        return [v_means2d, *first_only("GaussianRasterizer", spread, [v_means2d])]
+
+    (passed,) = linear_map(lambda means2d, *_: (means2d.clone(),), back, [means2d, *screen], [ids, half])
+    return passed

@@ -142,10 +142,6 @@ POSITION_LEFT, SH_SHARE = 0.01, 0.05
 # The opacities that `schedule.reset_every` leaves are at most this.
 RESET_OPACITY = 0.01
 
-# The limits of the `loss.opacity` that a run computes from `loss.opacity_total`: about the range that was
-# measured (docs/decisions.md).
-LEAST_OPACITY, MAX_OPACITY = 0.005, 0.05
-
 
 @dataclass(frozen=True)
 class ScheduleConfig:
@@ -237,8 +233,8 @@ class LossConfig:
             Gaussians; here the term does not act on Gaussians that a step does not see).
         opacity_total: weight of the same mean beside the sum of the losses of all training views. A run
             minimises the mean of these losses, so a new run sets `opacity` to this weight divided by the
-            number of training views, from `LEAST_OPACITY` to `MAX_OPACITY`. The run's own configuration has
-            the result in `opacity`, and 0 here. 0: `opacity` is the weight.
+            number of training views, from 0.005 to 0.05. The run's own configuration has the result in
+            `opacity`, and 0 here. 0: `opacity` is the weight.
         scale: weight of the mean smallest axis of the visible Gaussians.
         scale_reference: that axis is measured in units of extent x scale_reference.
     """

@@ -10,20 +10,23 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import timedelta
 from types import TracebackType
-from typing import Any, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from blitzgs.config.fields import Transport
 from blitzgs.distributed.shared_memory import LEAST_WORDS, SharedMemory, control_words, symmetric_words
 from blitzgs.distributed.watchdog import BUSY_SECONDS, NoWatchdog, Watchdog, open_store
 from blitzgs.util.errors import UserError
 
+if TYPE_CHECKING:
+    from blitzgs.config.fields import Transport
+
 T = TypeVar("T")
 ReduceOp = Literal["sum", "max"]
 _REDUCE_OPS = {"sum": dist.ReduceOp.SUM, "max": dist.ReduceOp.MAX}
+_TRANSPORTS: tuple[Transport, ...] = ("auto", "peer", "collective")
 
 DEFAULT_TIMEOUT_SECONDS = 120.0
 # The environment variables that configure torch's CUDA allocator, the present one and the one before it.
@@ -89,8 +92,8 @@ class Ranks:
                 ranks of several hosts.
             RuntimeError: the other ranks did not join, or "peer" was requested and is impossible.
         """
-        if transport not in get_args(Transport):
-            raise ValueError(f"transport must be one of {', '.join(get_args(Transport))}, not {transport!r}")
+        if transport not in _TRANSPORTS:
+            raise ValueError(f"transport must be one of {', '.join(_TRANSPORTS)}, not {transport!r}")
         world_size = int(os.environ.get("WORLD_SIZE", "1"))
         rank = int(os.environ.get("RANK", "0"))
         local_rank = int(os.environ.get("LOCAL_RANK", "0"))

@@ -25,7 +25,7 @@ from datetime import timedelta
 import torch
 from torch.distributed import PrefixStore, TCPStore  # type: ignore[attr-defined]
 
-from blitzgs.util.terminal import printable
+from blitzgs.util.errors import printable
 
 EXIT_STUCK = 75  # EX_TEMPFAIL: a restart may help
 # How long a rank continues to wait after another rank has reported a failure.

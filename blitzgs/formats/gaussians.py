@@ -14,8 +14,7 @@ import psutil
 import torch
 from torch import Tensor
 
-from blitzgs.util.errors import check_tensor
-from blitzgs.util.terminal import amount
+from blitzgs.util.errors import amount, check_tensor
 
 # Writers take so many Gaussians at a time: 62 MB at SH degree 3.
 BLOCK = 1 << 18

@@ -21,8 +21,8 @@ import numpy.typing as npt
 import torch
 
 from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased, unit_quats
+from blitzgs.util.errors import amount
 from blitzgs.util.rotations import quaternion_matrices
-from blitzgs.util.terminal import amount
 
 # Cells of the grid along an axis, as a power of two. A cell's key has the digits of an octree, 3 bits each.
 BITS = 8

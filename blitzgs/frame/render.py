@@ -40,8 +40,7 @@ from blitzgs.ops.projection_types import (
     Splats,
     Views,
 )
-from blitzgs.ops.rasterize import RasterizeSaved
-from blitzgs.ops.splat_gradients import GradientBuffer, SplatGradients
+from blitzgs.ops.splat_gradients import GradientBuffer, RasterizeSaved, SplatGradients
 from blitzgs.table.table import GaussianTable
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finds the rows that the views of a step may see, block by block, from conservative bounds of each block.
 
-Also converts the cull mask between the layout by row, which moves with rows, and that of the kernels, and
-moves blocks between a table on the host and a pool on the GPU.
+Also converts the cull mask between the layout by row, which moves with rows, and that of the kernels, copies
+rows of columns, and moves blocks between a table on the host and a pool on the GPU.
 """
 
 from __future__ import annotations
@@ -229,3 +229,34 @@ def swap_blocks_(
             or a table that is not in (pinned) memory of the host.
     """
     torch.ops.blitzgs.swap_blocks_(list(pool), list(table), n_written, slots, leaving, coming)
+
+
+def take_rows(
+    columns: Sequence[Tensor], rows: Tensor, out: Sequence[Tensor] | None = None
+) -> Sequence[Tensor]:
+    """Return the rows `rows` of each column, as `column.index_select(0, rows)` does.
+
+    For rows whose size is a multiple of 16 bytes, torch's op is slower, because it uses a whole block of
+    threads for each.
+
+    Args:
+        columns: [N, ...], any dtypes.
+        rows: int64 [M], from 0 to N - 1; not checked.
+        out: [M, ...], contiguous, get the rows; they may not overlap the columns. None: new tensors.
+
+    Returns:
+        [M, ...] of each column.
+    """
+    if out is None:
+        out = [column.new_empty((len(rows), *column.shape[1:])) for column in columns]
+    torch.ops.blitzgs.take_rows_(out, columns, rows)
+    return out
+
+
+def put_rows_(columns: Sequence[Tensor], rows: Tensor, fresh: Sequence[Tensor] = ()) -> None:
+    """Overwrite rows of columns, in place.
+
+    `columns`: [N, ...], any dtypes, contiguous. `rows`: int64 [M], from 0 to N - 1, each at most once; not
+    checked. `fresh`: what the rows become, [M, ...], of the dtype and row shape of each column; none: zeros.
+    """
+    torch.ops.blitzgs.put_rows_(columns, rows, fresh)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from blitzgs._library import below_autograd
-from blitzgs.ops.derivatives import first_only
+from blitzgs.ops.derivatives import first_only, full_gradients
 from blitzgs.ops.host import to_host
 from blitzgs.ops.projection_types import (
     N_OPTIONS,
@@ -20,7 +20,6 @@ from blitzgs.ops.projection_types import (
     Sizes,
     splats_of,
 )
-from blitzgs.ops.rows import full_gradients
 from blitzgs.ops.splat_gradients import gradient_table_of
 
 

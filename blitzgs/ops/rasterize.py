@@ -13,26 +13,11 @@ from torch import Tensor
 from blitzgs._library import below_autograd
 from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.intersect import TileGrid, pixels_of_tiles
-from blitzgs.ops.splat_gradients import GradientBuffer, gradient_columns
+from blitzgs.ops.splat_gradients import GradientBuffer, RasterizeSaved, gradient_columns
 
 # For alphas = 1 - transmittances. With the number 1, torch would first make a tensor of it, which takes 5 us
 # of the host's time. A tensor without dimensions on the CPU combines with tensors of any device and dtype.
 _ONE = torch.ones((), device="cpu")
-
-
-class RasterizeSaved(NamedTuple):
-    """What a forward pass saves for the ops of the backward pass, in the groups that these take."""
-
-    splats: list[Tensor]  # means2d [P, 2], conics [P, 3], splat_opacities [P], colors [P, D]
-    backgrounds: Tensor | None  # [B, D]; None: black
-    # isect_splats, int32 [I], the splats of each tile, front to back; tile_offsets, int64 [B * T + 1], where
-    # each tile's list begins.
-    lists: list[Tensor]
-    # transmittances [B, H, W], the weight of the background in each pixel; last_ids, int32 [B, H, W], where
-    # each pixel's list ended; packed_splats and tile_order, the splats and the order of the tiles in layouts
-    # that only the kernels of the backend read.
-    composited: list[Tensor]
-
 
 Arrange = Callable[[Sequence[Tensor]], Sequence[Tensor]]
 

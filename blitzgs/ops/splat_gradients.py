@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gradients of projected splats, in the two layouts in which compositing hands them to the projection."""
+"""Gradients of projected splats, in the two layouts in which compositing hands them to the projection.
+
+Also what the backward pass of compositing needs of the forward pass.
+"""
 
 from __future__ import annotations
 
@@ -84,6 +87,20 @@ class SplatGradients(NamedTuple):
     def _columns(self) -> Sequence[Tensor]:
         """Return the four columns."""
         return gradient_columns(self.parts[0]) if len(self.parts) == 1 else self.parts
+
+
+class RasterizeSaved(NamedTuple):
+    """What a forward pass saves for the ops of the backward pass, in the groups that these take."""
+
+    splats: list[Tensor]  # means2d [P, 2], conics [P, 3], splat_opacities [P], colors [P, D]
+    backgrounds: Tensor | None  # [B, D]; None: black
+    # isect_splats, int32 [I], the splats of each tile, front to back; tile_offsets, int64 [B * T + 1], where
+    # each tile's list begins.
+    lists: list[Tensor]
+    # transmittances [B, H, W], the weight of the background in each pixel; last_ids, int32 [B, H, W], where
+    # each pixel's list ended; packed_splats and tile_order, the splats and the order of the tiles in layouts
+    # that only the kernels of the backend read.
+    composited: list[Tensor]
 
 
 @dataclass

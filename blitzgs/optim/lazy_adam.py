@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from blitzgs._torch import quick_step
+from blitzgs.ops.derivatives import KeptMarks, distinct_rows
 from blitzgs.ops.lazy_adam import GrowingSchedule
-from blitzgs.ops.rows import KeptMarks, distinct_rows
 from blitzgs.optim.lazy_adam_checks import (
     MOMENTS,
     check_group,

@@ -24,8 +24,8 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.population.redistribution import global_positions
 from blitzgs.runs.checkpoint_files import DAMAGE, Manifest, Shard, finish, opened, verified, write_shard
+from blitzgs.table.placement import global_positions
 from blitzgs.util.errors import UserError, warn
 from blitzgs.util.output import is_lack_of_space
 
@@ -223,7 +223,7 @@ def load(path: Path, ranks: Ranks, device: torch.device | str) -> Loaded:
 
     With the world size that it was saved with, each rank gets its own shard unchanged. With another one the
     rows are redistributed: rank m gets the positions = m (mod M) of the global order
-    (`redistribution.global_positions`), and opens only the files that hold some of these rows.
+    (`placement.global_positions`), and opens only the files that hold some of these rows.
 
     `path`: folder returned by `Saving.finish`. CheckpointError: on every rank, when a file is missing, torn
     or altered.

@@ -24,8 +24,8 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
+from blitzgs.util.errors import amount
 from blitzgs.util.output import sync_to_disk
-from blitzgs.util.terminal import amount
 
 FORMAT = 2
 MANIFEST = "manifest.json"

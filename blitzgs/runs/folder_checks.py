@@ -17,8 +17,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.runs.run_files import CHECKPOINTS, WRITTEN
 from blitzgs.table.table import GaussianTable
 from blitzgs.util import output
-from blitzgs.util.errors import UserError, warn
-from blitzgs.util.terminal import amount
+from blitzgs.util.errors import UserError, amount, warn
 
 LOCK = ".lock"
 # A rank that torchrun restarts may begin before the process that it replaces has ended.

@@ -22,10 +22,9 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 from rich.table import Column
 
 from blitzgs.runs.run_files import LOG
-from blitzgs.util.errors import warn
+from blitzgs.util.errors import printable, warn
 from blitzgs.util.output import write_file
 from blitzgs.util.progress import Report, lines
-from blitzgs.util.terminal import printable
 
 BOARD = "tensorboard"
 # Largest number of records that are kept while the disk is full; then the oldest are dropped.

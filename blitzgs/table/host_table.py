@@ -12,10 +12,9 @@ import psutil
 import torch
 from torch import Tensor
 
-from blitzgs.ops.rows import take_rows
+from blitzgs.ops.blocks import take_rows
 from blitzgs.table.table import GROWTH, GaussianTable
-from blitzgs.util.errors import UserError
-from blitzgs.util.terminal import amount
+from blitzgs.util.errors import UserError, amount
 
 
 class HostMemoryError(UserError):

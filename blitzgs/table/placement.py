@@ -1,19 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chooses the rows of Gaussians that join a table when others leave it, so that few rows move.
+"""Chooses the rows of Gaussians that join a table when others leave it, and the ranks of all Gaussians.
 
 Blocks of 256 consecutive rows should be small in space (`blitzgs.table.blocks`), and their order does not
 matter. A new row takes the place of one that leaves the same block, or else a block near it in the table. New
 rows without such a place are put at the end, in Morton order among themselves: a run of blocks that are
-larger than the others, as fewer rows share the same space.
+larger than the others, as fewer rows share the same space. So few rows move.
+
+When the ranks' shards have become unequal, the Gaussians are divided anew (BlitzGS, 3.1).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
+from blitzgs.distributed.group import Ranks
 from blitzgs.ops.blocks import BLOCK_ROWS, morton_keys
-from blitzgs.table.table import Placement
+from blitzgs.table.table import GaussianTable, Placement
+
+# Rows are moved when the largest shard exceeds the smallest by this factor.
+MAX_IMBALANCE = 1.1
 
 
 def place(count: int, gone: Tensor, beside: Tensor, means: Tensor) -> Placement:
@@ -66,3 +74,44 @@ def _without_end(count: int, total: int, new: Tensor, free: Tensor) -> Placement
     new[at_end] = target[ends]
     is_used[ends] = False
     return Placement(total, new, is_used.nonzero().squeeze(1) + total, target[is_used])
+
+
+def redistribute(table: GaussianTable, ranks: Ranks, max_imbalance: float = MAX_IMBALANCE) -> bool:
+    """If the shards have become unequal, move the row at position p of the global order to rank p mod M.
+
+    Collective: every rank calls it. All columns are moved; each shard has its rows in the global order.
+
+    `table`: this rank's shard, changed in place. `max_imbalance`: nothing happens up to this ratio of the
+    largest to the smallest shard; 0: always redistribute. Returns whether rows were redistributed.
+    """
+    if ranks.world_size == 1:
+        return False
+    counts = ranks.all_gather(torch.tensor([len(table)], device=ranks.device))
+    sizes = torch.cat(counts).tolist()
+    if max(sizes) <= max_imbalance * min(sizes):
+        return False
+    mine = global_positions(sizes, ranks.rank) % ranks.world_size
+    table.move_rows(mine.to(table.device), ranks)
+    # Rows arrive by source rank; put them into the global order.
+    positions = torch.cat([global_positions(sizes, source) for source in range(ranks.world_size)])
+    arrived = positions[positions % ranks.world_size == ranks.rank]
+    table.permute(arrived.argsort().to(table.device))
+    return True
+
+
+def global_positions(sizes: Sequence[int], rank: int) -> Tensor:
+    """Return the position in the global order of each row of one shard.
+
+    The global order is row 0 of every rank, then row 1 of every rank, and so on; ranks without further rows
+    are skipped. So a table that was divided round-robin keeps its order. Shards whose sizes differ by at most
+    one (the larger ones first) already have exactly the positions = rank (mod M).
+
+    `sizes`: rows on each rank, M values. `rank`: the rank of the shard. Returns int64 [sizes[rank]],
+    ascending.
+    """
+    rows = torch.arange(sizes[rank], dtype=torch.int64)
+    positions = torch.zeros_like(rows)
+    for other, size in enumerate(sizes):
+        # Rows of `other` in the rounds before this one, plus its row of this round if it comes first.
+        positions += (rows + 1 if other < rank else rows).clamp(max=size)
+    return positions

@@ -31,8 +31,7 @@ from blitzgs.table.table import (
     sectors_in,
     stored_rows,
 )
-from blitzgs.util.errors import UserError
-from blitzgs.util.terminal import amount
+from blitzgs.util.errors import UserError, amount
 
 # Columns that steps change and that are therefore written back to the host.
 _WRITTEN = (

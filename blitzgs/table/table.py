@@ -13,8 +13,15 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.ops.blocks import BLOCK_ROWS, SECTOR_WORDS, WORD_BITS, rows_of_sectors, sectors_of_rows
-from blitzgs.ops.rows import put_rows_, take_rows
+from blitzgs.ops.blocks import (
+    BLOCK_ROWS,
+    SECTOR_WORDS,
+    WORD_BITS,
+    put_rows_,
+    rows_of_sectors,
+    sectors_of_rows,
+    take_rows,
+)
 
 # A column that has to be moved to become longer gets memory for this many times its rows.
 GROWTH = 1.25

@@ -10,14 +10,18 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from blitzgs.config.fields import LEAST_OPACITY, MAX_OPACITY, LossConfig
 from blitzgs.frame.tiles import LOSS_HALO
 from blitzgs.ops.photometric import photometric_fwd_bwd
 
 if TYPE_CHECKING:
+    from blitzgs.config.fields import LossConfig
     from blitzgs.frame.render import Frame
     from blitzgs.table.table import GaussianTable
     from blitzgs.training.batches import Batch
+
+# The limits of the `loss.opacity` that a run computes from `loss.opacity_total`: about the range that was
+# measured (docs/decisions.md).
+LEAST_OPACITY, MAX_OPACITY = 0.005, 0.05
 
 
 class LossTerms(NamedTuple):

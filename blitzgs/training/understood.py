@@ -14,11 +14,10 @@ from blitzgs.capture.images import ImageStore
 from blitzgs.capture.lengths import NEAR_OF_EXTENT, depths_seen, sampled
 from blitzgs.config.fields import Config
 from blitzgs.config.schedule import Schedule, stretched
-from blitzgs.population.growth import growth_limit
+from blitzgs.population.density import growth_limit
 from blitzgs.training.inputs import sharing_hint
 from blitzgs.training.state import TrainingState
-from blitzgs.util.errors import warn
-from blitzgs.util.terminal import printable
+from blitzgs.util.errors import printable, warn
 
 # Photographs that are decoded before the training, and views that are compared with the points.
 _DECODED, _PROJECTED = 16, 100

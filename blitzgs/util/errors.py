@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a user is told: warnings and errors at the right place, arguments of a wrong type, too little memory.
+"""What a user is told: texts, warnings and errors at the right place, wrong arguments, too little memory.
 
 Packages are imported where they are needed, as what warns may do without.
 """
@@ -15,14 +15,32 @@ from importlib import import_module
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
-from blitzgs.util.terminal import amount
-
 if TYPE_CHECKING:
     import torch
 
 
 class UserError(RuntimeError):
     """An error that a user can cause and correct: commands print its message, without a traceback."""
+
+
+# Control characters except tab, and the marks that change the direction of text.
+_CONTROLS = re.compile("[\x00-\x08\x0a-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+
+
+def printable(text: str, lines: bool = False) -> str:
+    """Return text for a terminal: control characters, as in names of files, are written as escapes.
+
+    `lines`: line feeds stay; for text without names that somebody else chose.
+    """
+    return _CONTROLS.sub(lambda match: "\n" if lines and match[0] == "\n" else ascii(match[0])[1:-1], text)
+
+
+def amount(size: float) -> str:
+    """Return a number of bytes as text, in a unit that leaves three digits or so."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size >= 0.9995 * factor:
+            return f"{size / factor:,.{max(0, 3 - len(str(int(size / factor))))}f} {unit}"
+    return f"{size:.0f} bytes"
 
 
 # Between a line of this package and its caller are contexts, and what torch wraps a function in.

@@ -135,7 +135,7 @@ def test_a_run_that_is_cut_off_keeps_its_results_and_goes_on(tmp_path, no_bench)
     write(tmp_path, {"a/test_a.py": "def test_a(): pass\n", "b/test_b.py": slow.format(True)})
     path, tests = tmp_path / "gpu_record.json", [tmp_path / "tests"]
     record = gpu_record.Record(path, ABOUT, resume=False)
-    assert not gpu_record.make_record(record, tests, "not other", tmp_path, time.monotonic() + 100, longest=8)
+    assert not gpu_record.make_record(record, tests, "not other", tmp_path, time.monotonic() + 100, longest=5)
     content = json.loads(path.read_text())
     assert not content["complete"] and content["rooms"]["tests/b"]["state"] == "cut off"
     assert content["tests"]["passed"] == 2 and content["tests"]["failed"] == 0

@@ -283,6 +283,15 @@ def test_absolute_gradients_for_densification():
     assert (screen.grad.abs() <= densify.grad + 1e-9).all() and screen.grad.abs().sum() < densify.grad.sum()
 
 
+@pytest.mark.parametrize("name", ["means2D", "means2D_densify"])
+def test_gradients_on_the_screen_are_first_derivatives_only(name):
+    screen = torch.zeros(COUNT, 3, dtype=torch.float64, requires_grad=True)
+    given = {"means2D": None, **without(leaves(7), "colors_precomp"), name: screen}
+    image, *_ = inria.GaussianRasterizer(settings())(**given)
+    (gradient,) = torch.autograd.grad(image.sum(), screen, create_graph=True)
+    refused(RuntimeError, "GaussianRasterizer has first derivatives only", gradient.sum().backward)
+
+
 def test_visibility():
     given, setting = leaves(), settings()
     means, depths = given["means3D"], given["means3D"] @ setting.viewmatrix[:3, 2] + setting.viewmatrix[3, 2]

@@ -95,10 +95,12 @@ def run_ranks(
     join=True,
     device="cpu",
     transport="auto",
+    stuck=frozenset(),
 ):
     """Return [function(ranks, *arguments) of each rank]; raise RankError if any rank fails.
 
-    With `join` false the function gets its rank's number and joins the job itself, as a command does.
+    With `join` false the function gets its rank's number and joins the job itself, as a command does. Ranks
+    that are `stuck` are killed as soon as the others have ended.
     """
     # Like torchrun's agent, the parent holds the store, so that it outlives any rank.
     store = TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
@@ -118,6 +120,8 @@ def run_ranks(
     waiting = dict(zip(pipes, range(world_size), strict=True))
     deadline = time.monotonic() + limit
     while waiting:
+        if stuck.issuperset(waiting.values()):
+            deadline = 0.0
         ready = multiprocessing.connection.wait(list(waiting), max(0.1, deadline - time.monotonic()))
         for pipe in ready or list(waiting):
             rank = waiting.pop(pipe)

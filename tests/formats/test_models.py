@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every format against a reader that shares nothing with its writer, and damaged files of each."""
 
 import io

@@ -187,7 +187,7 @@ def test_rendering_without_a_loss_composites_no_halo():
 
 
 def _gather_all(ranks):
-    from blitzgs.population.redistribution import redistribute
+    from blitzgs.table.placement import redistribute
 
     table = shard(ranks)
     table["extra"] = torch.stack((table["id"] % 251, table["id"] % 7), 1).to(torch.uint8)
@@ -214,7 +214,7 @@ def test_redistribution_conserves_every_row(world_size):
 
 
 def test_one_rank_has_nothing_to_redistribute():
-    from blitzgs.population.redistribution import redistribute
+    from blitzgs.table.placement import redistribute
 
     table = random_gaussians(5)
     assert not redistribute(table, Ranks(), 0)

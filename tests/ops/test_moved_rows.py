@@ -7,7 +7,15 @@ import pytest
 import torch
 
 from blitzgs.ops import host
-from blitzgs.ops.blocks import BLOCK_ROWS, rows_of_sectors, sectors_of_rows, seen_blocks, swap_blocks_
+from blitzgs.ops.blocks import (
+    BLOCK_ROWS,
+    put_rows_,
+    rows_of_sectors,
+    sectors_of_rows,
+    seen_blocks,
+    swap_blocks_,
+    take_rows,
+)
 from blitzgs.ops.counter_random import (
     KEY_BITS,
     find_digit_,
@@ -18,7 +26,6 @@ from blitzgs.ops.counter_random import (
 )
 from blitzgs.ops.host import PinnedNumbers
 from blitzgs.ops.projection_types import Views
-from blitzgs.ops.rows import put_rows_, take_rows
 from blitzgs.table.blocks import BlockIndex
 from blitzgs.table.placement import place
 from blitzgs.table.table import CULL, sectors_in

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from blitzgs.call.layout import Places
+from blitzgs.ops.derivatives import KeptMarks, distinct_rows, sparse_rows
 from blitzgs.ops.exchange import PLACE_SPLATS, gather_splats, scatter_splats
 from blitzgs.ops.projection_types import first_rows
-from blitzgs.ops.rows import KeptMarks, distinct_rows, sparse_rows
 from tests.helpers import BACKENDS, DEVICES, refused
 
 COLUMNS = [((2,), torch.float32), ((3,), torch.float64), ((), torch.int64), ((), torch.float32)]

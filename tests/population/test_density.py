@@ -11,9 +11,17 @@ from blitzgs.config.fields import PopulationConfig
 from blitzgs.distributed.group import Ranks
 from blitzgs.ops.blocks import WORD_BITS
 from blitzgs.ops.counter_random import hash_keys, normal
-from blitzgs.population import growth
-from blitzgs.population.density import DensityRules, cap_opacities, densify, rotations
-from blitzgs.population.growth import GrowthLimit, growth_limit, memory_limit, rows_that_fit
+from blitzgs.population import density
+from blitzgs.population.density import (
+    DensityRules,
+    GrowthLimit,
+    cap_opacities,
+    densify,
+    growth_limit,
+    memory_limit,
+    rotations,
+    rows_that_fit,
+)
 from blitzgs.runs.clean import floaters, views_counting
 from blitzgs.table.placement import place
 from blitzgs.table.table import PARAMETERS, GaussianTable
@@ -237,7 +245,7 @@ def test_a_gpu_holds_more_than_a_small_table_and_less_than_its_memory():
 def test_a_table_on_the_host_is_limited_by_the_memory_of_the_host(monkeypatch):
     table, ranks = random_table(999), Ranks(device=torch.device("cuda"), local_world_size=2)
     sizes = table.row_bytes.values()
-    monkeypatch.setattr(growth, "available_bytes", lambda: 2_000_000_000)
+    monkeypatch.setattr(density, "available_bytes", lambda: 2_000_000_000)
     nothing, new = torch.empty(0, dtype=torch.int64), {name: table[name][:1] for name in table}
     table.replace(place(999, nothing, nothing.new_zeros(1), new["means"]), new)
     available = 1_000_000_000 + 1250 * sum(sizes)

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.population.density import DensityRules, densify
-from blitzgs.population.redistribution import redistribute
 from blitzgs.spawn import lineage_parts
 from blitzgs.spawn.candidates import FEATURES, spawn_features
 from blitzgs.spawn.lineage import Births, Cause, Ledger, Lineage, LineageError, initial_births
 from blitzgs.spawn.lineage_parts import PART_NAME, read_lineage
+from blitzgs.table.placement import redistribute
 from tests.distributed.rank_harness import run_ranks
 from tests.helpers import needs_cuda, refused
 from tests.population.test_density import random_table

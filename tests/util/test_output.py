@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from blitzgs.util import progress
 from blitzgs.util.charts import line_chart
+from blitzgs.util.errors import amount, printable
 from blitzgs.util.output import OutputFolder, new_file, write_file
 from blitzgs.util.progress import Laps, image_progress
-from blitzgs.util.terminal import amount, printable
 from tests.helpers import refused
 
 PARTS = st.sampled_from(

@@ -42,13 +42,19 @@ def settled(studio):
         return shown is not None and shown.ask.scale == 1.0 and shown.ask.version == visitor.version
 
     wait_for(sharp, 60, "a picture of full quality")
-    time.sleep(0.6)  # the browser draws it
     return visitor
 
 
 def picture(browser):
     """Return the page without its panel and the figures."""
     return browser.screenshot()[160:560, 20:760].astype(int)
+
+
+def drawn(studio, browser):
+    """Wait until the page shows a picture of full quality; return it."""
+    settled(studio)
+    time.sleep(0.6)  # the browser draws it
+    return picture(browser)
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +106,7 @@ def test_the_page_shows_the_model(studio, browser):
 @needs_chromium
 def test_a_drag_turns_the_camera(studio, browser):
     visitor = settled(studio)
-    before, place = picture(browser), visitor.stance.position
+    before, place = drawn(studio, browser), visitor.stance.position
     browser.drag((300, 300), (420, 330))
     settled(studio)
     assert np.linalg.norm(visitor.stance.position - place) > 0.05
@@ -110,7 +116,7 @@ def test_a_drag_turns_the_camera(studio, browser):
 @needs_chromium
 def test_a_control_changes_the_picture(studio, browser):
     visitor = settled(studio)
-    before = picture(browser)
+    before = drawn(studio, browser)
     box = browser.evaluate(
         """(() => {
           const field = [...document.querySelectorAll('input')].find(e => e.value === 'RGB');
@@ -166,14 +172,12 @@ def test_photograph_and_render_are_compared(studio, browser):
     pictures = {}
     for kind in ("off", "wipe", "side by side", "error"):
         visitor.change(comparison=kind)
-        settled(studio)
-        pictures[kind] = picture(browser)
+        pictures[kind] = drawn(studio, browser)
         assert ("dB" in browser.figures()) == (kind != "off")
     for kind in ("wipe", "side by side", "error"):
         assert np.abs(pictures[kind] - pictures["off"]).mean() > 1, kind
     visitor.change(comparison="off")
-    settled(studio)
-    before = picture(browser)
+    before = drawn(studio, browser)
     studio.page.exhibit.exposures[0] = np.array([[0.5, 0.5, 0.5], [0.0, 0.0, 0.0]])
     visitor.change(exposure=True)
     settled(studio)

@@ -10,13 +10,21 @@ import torch
 
 from blitzgs.config.fields import RESET_OPACITY
 from blitzgs.config.schedule import Event
-from blitzgs.population.density import STATISTICS, DensityReport, DensityRules, cap_opacities, densify
-from blitzgs.population.growth import GrowthLimit, growth_limit, memory_limit
-from blitzgs.population.redistribution import MAX_IMBALANCE, redistribute
+from blitzgs.population.density import (
+    STATISTICS,
+    DensityReport,
+    DensityRules,
+    GrowthLimit,
+    cap_opacities,
+    densify,
+    growth_limit,
+    memory_limit,
+)
 from blitzgs.population.relocation import relocate
 from blitzgs.runs.guard import ModelLostError, check_table
 from blitzgs.table.blocks import sort_rows, spread
 from blitzgs.table.host_table import HostTable
+from blitzgs.table.placement import MAX_IMBALANCE, redistribute
 from blitzgs.table.table import PARAMETERS
 from blitzgs.training.state import TrainingState
 

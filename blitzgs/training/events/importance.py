@@ -10,10 +10,10 @@ from torch import Tensor
 
 from blitzgs.config.schedule import Event
 from blitzgs.population.importance import Importance, ViewBatch, sample_by_score, sweep, top_by_score
-from blitzgs.population.redistribution import redistribute
 from blitzgs.runs.guard import ModelLostError, check_table
 from blitzgs.spawn.lineage import Cause
 from blitzgs.table.blocks import sort_rows
+from blitzgs.table.placement import redistribute
 from blitzgs.table.table import opacity_logit
 from blitzgs.training import view_level
 from blitzgs.training.state import TrainingState

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What commands print: it survives a closed terminal, and contains nothing that controls the terminal."""
+"""Output of commands that survives a closed terminal."""
 
 from __future__ import annotations
 
@@ -7,29 +7,9 @@ import contextlib
 import errno
 import io
 import os
-import re
 import sys
 from collections.abc import Iterator
 from typing import Any, TextIO
-
-# Control characters except tab, and the marks that change the direction of text.
-_CONTROLS = re.compile("[\x00-\x08\x0a-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
-
-
-def printable(text: str, lines: bool = False) -> str:
-    """Return text for a terminal: control characters, as in names of files, are written as escapes.
-
-    `lines`: line feeds stay; for text without names that somebody else chose.
-    """
-    return _CONTROLS.sub(lambda match: "\n" if lines and match[0] == "\n" else ascii(match[0])[1:-1], text)
-
-
-def amount(size: float) -> str:
-    """Return a number of bytes as text, in a unit that leaves three digits or so."""
-    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if size >= 0.9995 * factor:
-            return f"{size / factor:,.{max(0, 3 - len(str(int(size / factor))))}f} {unit}"
-    return f"{size:.0f} bytes"
 
 
 class Output(io.FileIO):
@@ -97,3 +77,29 @@ def surviving_output() -> Iterator[dict[str, Output]]:
         for name, stream in previous.items():
             getattr(sys, name).flush()
             setattr(sys, name, stream)
+
+
+# Commands whose result is what they print.
+_PRINTING = (
+    "eval", "completion", "--json", "--show-config", "--check", "--help", "--help-fields", "-h", "--version"
+)  # fmt: skip
+
+
+def report_lost(given: list[str], outputs: dict[str, Output]) -> int:
+    """Say that a part of the output was lost; return 1 if it was the result of the command, else 0.
+
+    A reader that closes its end, as `head` does, wants no more: this is no failure.
+    """
+    for name in outputs:
+        getattr(sys, name).flush()
+    lost = [output for output in outputs.values() if output.lost and output.has_reader]
+    for output in lost:
+        print(
+            f"blitzgs: {output.title} cannot be written ({output.lost}): what was printed there is "
+            "incomplete; files are complete",
+            file=sys.stderr,
+        )
+    return int(
+        any(output.title == "standard output" for output in lost)
+        and any(text.partition("=")[0] in _PRINTING for text in given)
+    )
