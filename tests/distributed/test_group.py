@@ -158,7 +158,7 @@ def _work(ranks, hang):
     ranks.barrier()
     if ranks.rank == 1:
         with ranks.watchdog.working("writing to a slow disk"):
-            time.sleep(5)
+            time.sleep(6)
         if hang:
             time.sleep(60)
     return ranks.all_reduce(torch.ones(1)).item(), announced[:1]
