@@ -50,9 +50,9 @@ TESTS = [
     *(f"{OPS}project_step.py::test_equals_backward_and_step[{case}-cuda]" for case in (
         "1007-16-3-3", "1007-16-2-1", "1007-16-1-2", "333-16-0-1", "333-4-1-2", "333-25-3-1",
     )),
-    # Rows, coefficients, degree, views.
-    *(f"{OPS}project_step.py::test_gradients_are_read_from_the_tables_of_several_ranks[{case}]" for case in (
-        "3001-16-3-4", "700-16-2-1", "700-4-1-2", "700-16-0-1", "70-16-3-12",
+    # Rows, coefficients, degree, views; columns of the table of gradients.
+    *(f"{OPS}project_step.py::test_gradients_are_read_where_they_are[{case}-12-cuda]" for case in (
+        "3000-16-3-3", "700-16-2-1", "700-4-1-2", "700-16-0-1",
     )),
     *(OPS + test for test in (
         "lazy_adam.py::test_float32_drift_of_any_second_moment[40-30-cuda]",
@@ -68,7 +68,8 @@ TESTS = [
         "intersect.py::test_a_table_of_gradients_is_zeroed_for_the_splats[700-1500-tiles0]",
         "intersect.py::test_lists_with_too_little_room_are_the_nearest_splats[tiles1-0.5]",
         "rows.py::test_splats_reach_their_groups[6000-cuda]",
-        "rows.py::test_sums_follow_the_splats_back[5000-cuda]",
+        "rows.py::test_sums_follow_the_splats_back[widths0-5000-cuda]",
+        "rows.py::test_sums_follow_the_splats_back[widths1-5000-cuda]",
         "render.py::test_equal_the_image_bit_for_bit[3-cuda-float32]",
         "render.py::test_a_list_of_pixels_has_their_rows_in_its_order[cuda]",
         "render.py::test_nothing_to_composite[cuda]",
