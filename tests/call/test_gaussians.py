@@ -240,6 +240,13 @@ def test_errors(degree, dirs, coeffs, message):
     refused(ValueError, message, blitzgs.spherical_harmonics, degree, torch.zeros(dirs), torch.zeros(coeffs))
 
 
+def test_masks_and_coefficients_of_other_rows_are_refused():
+    message = r"leading dimensions must broadcast: dirs \[4, 3\], coeffs \[{}, 4, 3\], masks {}"
+    for rows, masks, shown in ((5, None, "None"), (4, torch.ones(3, dtype=torch.bool), r"\[3\]")):
+        arguments = 1, torch.zeros(4, 3), torch.zeros(rows, 4, 3), masks
+        refused(ValueError, message.format(rows, shown), blitzgs.spherical_harmonics, *arguments)
+
+
 def with_channels(scene, channels):
     """The scene with other SH channels; the last ones are those that it had."""
     extra = torch.randn(*scene.colors.shape[:-1], channels - 3, dtype=scene.colors.dtype)
