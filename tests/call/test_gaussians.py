@@ -192,6 +192,14 @@ def test_wrong_arguments_are_named(change, error, message):
     refused(error, message, blitzgs.rasterize_num_contributing_gaussians, *given)
 
 
+def test_entries_of_two_calls_are_refused():
+    metas = [rasterize_scene(random_scene(n=n))[2] for n in (5, 60)]
+    few, many = (arguments(meta) for meta in metas)
+    count = blitzgs.rasterize_num_contributing_gaussians
+    refused(RuntimeError, "tile_offsets must ascend", count, *many[:4], few[4], *many[5:])
+    refused(RuntimeError, "isect_splats must be numbers of the", count, *few[:3], *many[3:])
+
+
 def by_scipy(dirs, degree):
     """The basis from complex spherical harmonics, [N, K]."""
     x, y, z = torch.nn.functional.normalize(dirs, dim=1).unbind(1)
