@@ -142,7 +142,7 @@ def rasterize_num_contributing_gaussians(
     Raises:
         TypeError: an argument is not a tensor or has a wrong dtype.
         ValueError: a shape does not fit, or a pixel is outside the images.
-        RuntimeError: the tile size is not 16 on CUDA.
+        RuntimeError: the tile size is not 16 on CUDA, or on the CPU, the entries are of several calls.
     """
     found, lead = _splats_of_pixels(
         means2d, conics, opacities, tile_offsets, flatten_ids, image_width, image_height, tile_size, 0,

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from numbers import Integral
 from typing import Any, NamedTuple
 
 import torch
@@ -41,7 +42,8 @@ def with_signals(gaussians: Gaussians, values: Tensor, sh_degree: int | None) ->
         per_view = shape[:-1] == (*batch, views, count)
         wanted, fits = "[..., N, E] or [..., C, N, E]", per_view or shape[:-1] == (*batch, count)
     else:
-        if isinstance(sh_degree, bool) or sh_degree not in range(_MAX_DEGREE + 1):
+        whole = isinstance(sh_degree, (Integral, torch.SymInt)) and not isinstance(sh_degree, bool)
+        if not whole or not 0 <= sh_degree <= _MAX_DEGREE:
             raise ValueError(f"extra_signals_sh_degree must be None or 0 to {_MAX_DEGREE}, got {sh_degree!r}")
         least = (sh_degree + 1) ** 2
         wanted = f"SH coefficients [N, K, E] or [..., N, K, E] with K of at least {least}"
@@ -184,18 +186,19 @@ def checked_pixels(
         if image_ids is not None:
             raise ValueError("image_ids need pixels; give both")
         return None
-    if image_ids is None:
-        if images != 1:
-            raise ValueError(f"pixels of {images} images need image_ids, the image of each pixel")
-        image_ids = torch.zeros_like(pixels[:, 0])
+    if image_ids is None and images != 1:
+        raise ValueError(f"pixels of {images} images need image_ids, the image of each pixel")
     for name, values in (("pixels", pixels), ("image_ids", image_ids)):
+        if values is None:
+            continue
         if not isinstance(values, Tensor) or values.is_floating_point() or values.dtype == torch.bool:
             raise TypeError(f"{name} must be a tensor of integers")
-    if pixels.dim() != 2 or pixels.shape[1] != 2 or image_ids.shape != pixels.shape[:1]:
-        raise ValueError(
-            f"pixels must be [M, 2] (row, column) and image_ids [M], got {[*pixels.shape]} and "
-            f"{[*image_ids.shape]}"
-        )
+    if pixels.dim() != 2 or pixels.shape[1] != 2:
+        raise ValueError(f"pixels must be [M, 2] (row, column), got {[*pixels.shape]}")
+    if image_ids is None:
+        image_ids = torch.zeros_like(pixels[:, 0])
+    if image_ids.shape != pixels.shape[:1]:
+        raise ValueError(f"image_ids must be [M] = {[len(pixels)]}, got {[*image_ids.shape]}")
     places = torch.stack([image_ids.long(), *pixels.long().unbind(1)], dim=1)
     outside = ((places < 0) | (places >= places.new_tensor([images, height, width]))).any(dim=1)
     if outside.any():

@@ -107,7 +107,7 @@ def position_noise(
     """Return noise to add to means: the more transparent a Gaussian, the farther it moves.
 
     ``scaler sigmoid(100 (threshold - o)) Sigma n`` with the covariance Sigma and n standard normal
-    (3DGS-MCMC, Kheradmand et al. 2024, eq. 8 and 9): what gsplat's `inject_noise_to_position` adds, without a
+    (3DGS-MCMC, Kheradmand et al. 2024, eq. 8): what gsplat's `inject_noise_to_position` adds, without a
     tensor of matrices. The numbers depend on (row, seed, step) alone, not on torch's generator.
 
     Args:

@@ -112,7 +112,7 @@ def raw_rasterization(
 
     Raises:
         TypeError: an argument is not a tensor, or not the kind of number it should be, or gsplat has no such
-            argument; or the tensors are neither float32 nor float64.
+            argument; or the tensors are neither float32 nor float64; or `optimizers` are no optimisers.
         ValueError: an argument is not supported, has a wrong shape or value, or another dtype or device than
             the others; or a parameter is not a leaf, but would get a sparse gradient. The message names it.
         RuntimeError: float64 tensors are on a GPU, or the call is inside a transform of `torch.func`.
@@ -194,7 +194,11 @@ def _lazy(optimizers: Any) -> list[CatchesUp]:
             "optimizers must be an optimiser, or a mapping or a sequence of them, got "
             f"{type(optimizers).__name__}"
         )
-    given = optimizers.values() if isinstance(optimizers, Mapping) else optimizers
+    given = list(optimizers.values() if isinstance(optimizers, Mapping) else optimizers)
+    for optimizer in given:
+        # Without this check, a name or a parameter in place of its optimiser would leave rows behind.
+        if not hasattr(optimizer, "step") and not hasattr(optimizer, "catch_up"):
+            raise TypeError(f"optimizers must be optimisers, got {type(optimizer).__name__} among them")
     return [optimizer for optimizer in dict.fromkeys(given) if hasattr(optimizer, "catch_up")]
 
 

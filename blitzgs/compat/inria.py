@@ -114,6 +114,12 @@ class GaussianRasterizer(torch.nn.Module):
             RuntimeError: a tensor has a wrong shape, dtype or device; the message names it.
         """
         settings = self.raster_settings
+        screen = {"means2D": means2D, "means2D_densify": means2D_densify}
+        for name, tensor in screen.items():
+            if tensor is not None and (tensor.shape[:-1] != means3D.shape[:-1] or tensor.shape[-1] < 2):
+                raise RuntimeError(
+                    f"{name} must be [N, 2 or more] with N = {len(means3D)}, got {list(tensor.shape)}"
+                )
         if dc is not None:
             shs = dc if shs is None else torch.cat([dc, shs], dim=1)
         if (shs is None) == (colors_precomp is None):
@@ -125,7 +131,7 @@ class GaussianRasterizer(torch.nn.Module):
         if means2D is not None or means2D_densify is not None:
             half = means3D.new_tensor([width / 2, height / 2])
             ids = splats.gaussian_ids.long()
-            means2d = _with_gradients_of(means2d, (means2D, means2D_densify), ids, half, absolute)
+            means2d = _with_gradients_of(means2d, list(screen.values()), ids, half, absolute)
         if colors_precomp is None:
             channels = splats.colors
         else:
@@ -204,6 +210,8 @@ def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = 
     Raises:
         ValueError: wrong shapes, or another padding.
     """
+    if img1.dim() != 4 or img1.shape[1] != 3 or img2.shape != img1.shape:
+        raise ValueError(f"img1 and img2 must be [B, 3, H, W], got {list(img1.shape)} and {list(img2.shape)}")
     x, y = (image.permute(0, 2, 3, 1).contiguous() for image in (img1, img2))
     return 1 - l1_ssim(x, y, ssim_weight=1.0, padding=padding)
 

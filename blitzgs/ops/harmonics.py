@@ -36,6 +36,13 @@ def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor
         raise ValueError(f"dirs must be [..., 3], got {list(dirs.shape)}")
     if coeffs.dim() < 2 or coeffs.shape[-2] < count:
         raise ValueError(f"coeffs must be [..., K, D] with K >= {count}, got {list(coeffs.shape)}")
+    try:
+        torch.broadcast_shapes(dirs.shape[:-1], coeffs.shape[:-2], () if masks is None else masks.shape)
+    except RuntimeError:
+        raise ValueError(
+            f"leading dimensions must broadcast: dirs {list(dirs.shape)}, coeffs {list(coeffs.shape)}, masks "
+            f"{None if masks is None else list(masks.shape)}"
+        ) from None
     dtype = torch.promote_types(dirs.dtype, coeffs.dtype)
     values = (_basis(dirs, degree).unsqueeze(-2).to(dtype) @ coeffs[..., :count, :].to(dtype)).squeeze(-2)
     return values if masks is None else torch.where(masks.unsqueeze(-1), values, torch.zeros_like(values))

@@ -68,7 +68,7 @@ def position_noise_(
     """Add noise to the means of the listed Gaussians, in place; more transparent Gaussians move farther.
 
     ``means += strength * sigmoid(100 (threshold - opacity)) * Sigma n`` with the covariance Sigma and n
-    standard normal (3DGS-MCMC, Kheradmand et al. 2024, eq. 8 and 9). The draws depend on (id, seed, step)
+    standard normal (3DGS-MCMC, Kheradmand et al. 2024, eq. 8). The draws depend on (id, seed, step)
     alone.
 
     Args:

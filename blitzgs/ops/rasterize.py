@@ -90,7 +90,8 @@ def rasterize(
         Renders [B, H, W, D] and alphas [B, H, W].
 
     Raises:
-        RuntimeError: wrong shapes or dtypes, or a tile range outside the images.
+        RuntimeError: wrong shapes or dtypes, or a tile range outside the images; on the CPU also lists of
+            other splats.
         ValueError: `store_absgrad` under `torch.compile`.
     """
     splats = (means2d, conics, splat_opacities, colors, backgrounds, isect_splats, tile_offsets)

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // What the ops that composite splats share: the checked splats, and the ops that others call.
 #pragma once
+#include <algorithm>
 #include <tuple>
 
 #include "common/op.h"
@@ -24,6 +25,7 @@ struct ListedSplats {
     opacities = checked(op, "splat_opacities", opacities_in, dtype, {n_splats});
     isect_splats = checked(op, "isect_splats", isect_splats_in, ScalarType::Int, {-1});
     tile_offsets = checked(op, "tile_offsets", tile_offsets_in, ScalarType::Long, {grid.count() + 1});
+    if (tile_offsets.is_cpu()) check_lists(op);  // on CUDA the host would wait for the values
   }
 
   // The colours [P, D] to composite, before backgrounds [B, D] or black.
@@ -49,6 +51,22 @@ struct ListedSplats {
             static_cast<int>(n_channels),
             grid,
             splat_count.known_splats};
+  }
+
+  // Lists of another call, or of other splats, would lead the kernels out of the tensors.
+  void check_lists(const char* op) const {
+    const auto* const offsets = data<std::int64_t>(tile_offsets);
+    const auto* const list = data<std::int32_t>(isect_splats);
+    const std::int64_t tiles = grid.count(), entries = isect_splats.size(0);
+    BLITZGS_CHECK(
+        offsets[0] >= 0 && offsets[tiles] <= entries && std::is_sorted(offsets, offsets + tiles + 1), op,
+        "tile_offsets must ascend from 0 to at most the ", entries, " entries of isect_splats");
+    std::uint32_t largest = 0;  // a negative number becomes a large one
+    for (std::int64_t i = offsets[0]; i < offsets[tiles]; ++i) {
+      largest = std::max(largest, static_cast<std::uint32_t>(list[i]));
+    }
+    BLITZGS_CHECK(offsets[tiles] == offsets[0] || largest < n_splats, op,
+                  "isect_splats must be numbers of the ", n_splats, " splats");
   }
 
   TileGrid grid;

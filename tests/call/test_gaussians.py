@@ -192,6 +192,14 @@ def test_wrong_arguments_are_named(change, error, message):
     refused(error, message, blitzgs.rasterize_num_contributing_gaussians, *given)
 
 
+def test_entries_of_two_calls_are_refused():
+    metas = [rasterize_scene(random_scene(n=n))[2] for n in (5, 60)]
+    few, many = (arguments(meta) for meta in metas)
+    count = blitzgs.rasterize_num_contributing_gaussians
+    refused(RuntimeError, "tile_offsets must ascend", count, *many[:4], few[4], *many[5:])
+    refused(RuntimeError, "isect_splats must be numbers of the", count, *few[:3], *many[3:])
+
+
 def by_scipy(dirs, degree):
     """The basis from complex spherical harmonics, [N, K]."""
     x, y, z = torch.nn.functional.normalize(dirs, dim=1).unbind(1)
@@ -238,6 +246,13 @@ def test_gradients():
 )
 def test_errors(degree, dirs, coeffs, message):
     refused(ValueError, message, blitzgs.spherical_harmonics, degree, torch.zeros(dirs), torch.zeros(coeffs))
+
+
+def test_masks_and_coefficients_of_other_rows_are_refused():
+    message = r"leading dimensions must broadcast: dirs \[4, 3\], coeffs \[{}, 4, 3\], masks {}"
+    for rows, masks, shown in ((5, None, "None"), (4, torch.ones(3, dtype=torch.bool), r"\[3\]")):
+        arguments = 1, torch.zeros(4, 3), torch.zeros(rows, 4, 3), masks
+        refused(ValueError, message.format(rows, shown), blitzgs.spherical_harmonics, *arguments)
 
 
 def with_channels(scene, channels):

@@ -239,6 +239,8 @@ def test_optimizers_may_be_one_of_any_class():
     for optimizer_class in (torch.optim.Adam, LazyAdam):
         assert torch.equal(raw(p, scene, optimizers=optimizer_class(p.values()))[0], expected)
     refused(TypeError, "optimizers must be .* mapping or a sequence .* NoneT", raw, p, scene, optimizers=None)
+    for mistaken, named in ((p, "Tensor among them"), (p.keys(), "str among them")):
+        refused(TypeError, f"optimizers must be optimisers, got {named}", raw, p, scene, optimizers=mistaken)
 
 
 def test_wrong_shapes_are_refused_by_name():

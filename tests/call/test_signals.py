@@ -226,6 +226,7 @@ def test_half_precision_signals_are_computed_in_full_precision():
         ({"extra_signals": torch.zeros(60, 4090)}, "extra_signals must have 1 to 4089 channels, got 4090"),
         ({"extra_signals": torch.zeros(60, 3, 2), "extra_signals_sh_degree": 1}, "K of at least 4"),
         ({"extra_signals": torch.zeros(60, 16, 2), "extra_signals_sh_degree": 4}, "0 to 3, got 4"),
+        ({"extra_signals": torch.zeros(60, 16, 2), "extra_signals_sh_degree": 1.0}, r"0 to 3, got 1\.0"),
         ({"return_normals": True, "covars": torch.eye(3).expand(60, 3, 3)}, "does not support covars"),
         ({"extra_signals_sh_degree": 1}, "extra_signals_sh_degree needs extra_signals"),
     ],
@@ -309,7 +310,16 @@ def test_other_tile_sizes():
             TypeError,
             "pixels must be a tensor",
         ),
-        ({"pixels": torch.zeros(3, 2).int(), "image_ids": torch.zeros(2).int()}, ValueError, r"\[M, 2\]"),
+        (
+            {"pixels": torch.zeros(3, 2).int(), "image_ids": torch.zeros(2).int()},
+            ValueError,
+            r"\[M\] = \[3\]",
+        ),
+        (
+            {"pixels": torch.zeros(3, 2).int(), "image_ids": [0, 1, 0]},
+            TypeError,
+            "image_ids must be a tensor",
+        ),
         (
             {"pixels": torch.tensor([[0, 0], [32, 5]]), "image_ids": torch.tensor([0, 1])},
             ValueError,
@@ -320,3 +330,15 @@ def test_other_tile_sizes():
 )
 def test_wrong_pixels_are_named(options, error, message):
     refused(error, message, rasterize_scene, random_scene(), **options)
+
+
+@pytest.mark.parametrize(
+    "pixels,error,message",
+    [
+        ([[0, 0], [1, 1]], TypeError, "pixels must be a tensor of integers"),
+        (torch.tensor([3, 4]), ValueError, r"pixels must be \[M, 2\] \(row, column\), got \[2\]"),
+        (torch.zeros(3, 3).int(), ValueError, r"pixels must be \[M, 2\] \(row, column\), got \[3, 3\]"),
+    ],
+)
+def test_wrong_pixels_of_a_single_image_are_named(pixels, error, message):
+    refused(error, message, rasterize_scene, random_scene(cameras=1), pixels=pixels)

@@ -292,6 +292,14 @@ def test_gradients_on_the_screen_are_first_derivatives_only(name):
     refused(RuntimeError, "GaussianRasterizer has first derivatives only", gradient.sum().backward)
 
 
+@pytest.mark.parametrize("name", ["means2D", "means2D_densify"])
+@pytest.mark.parametrize("shape", [(COUNT + 1, 3), (COUNT, 1), (COUNT,)], ids=str)
+def test_screen_tensors_of_another_shape_are_named(name, shape):
+    given = {"means2D": None, **without(leaves(7), "colors_precomp"), name: torch.zeros(shape)}
+    message = rf"{name} must be \[N, 2 or more\] with N = {COUNT}, got \[{shape[0]}"
+    refused(RuntimeError, message, inria.GaussianRasterizer(settings()), **given)
+
+
 def test_visibility():
     given, setting = leaves(), settings()
     means, depths = given["means3D"], given["means3D"] @ setting.viewmatrix[:3, 2] + setting.viewmatrix[3, 2]
@@ -363,3 +371,6 @@ def test_fused_ssim_is_the_mean_ssim():
     assert relative_error(*gradients) < 1e-9
     inner = ssim[:, 5:-5, 5:-5].mean()
     assert abs((inria.fused_ssim(x, y, padding="valid") - inner).item()) < 1e-12
+    for shape in ((3, 20, 24), (2, 1, 20, 24)):
+        message = r"img1 and img2 must be \[B, 3, H, W\], got"
+        refused(ValueError, message, inria.fused_ssim, torch.zeros(shape), torch.zeros(shape))

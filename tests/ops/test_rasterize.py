@@ -289,6 +289,23 @@ def test_errors_name_the_value():
         rasterize(*splats.values(), tile_lists[0], tile_lists[1][:-1], **options)
 
 
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda listed, offsets: (listed, offsets + 1), "tile_offsets must ascend from 0 to at most the"),
+        (lambda listed, offsets: (listed, offsets - 1), "tile_offsets must ascend"),
+        (lambda listed, offsets: (listed, offsets.flip(0)), "tile_offsets must ascend"),
+        (lambda listed, offsets: (listed + 1, offsets), "isect_splats must be numbers of the 20 splats"),
+        (lambda listed, offsets: (listed - 20, offsets), "isect_splats must be numbers of the 20 splats"),
+    ],
+)
+def test_lists_of_other_splats_are_refused(change, message):
+    splats = random_splats(20, WIDTH, HEIGHT)
+    changed = change(*lists(splats))
+    with pytest.raises(RuntimeError, match=message):
+        rasterize(*splats.values(), *changed, n_cameras=1, width=WIDTH, height=HEIGHT)
+
+
 def test_a_gradient_buffer_gives_its_zeros_once():
     means2d, zeros = torch.ones(5, 2), torch.zeros(5, 12)
     gradients = GradientBuffer(zeros)
