@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Noise on the means of almost transparent Gaussians (stochastic gradient Langevin dynamics; Kheradmand et
-// al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo", eq. 8 and 9).
+// al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo", eq. 8).
 //
 // For every listed row i, with opacity o = sigmoid(opacities[i]) and covariance Sigma = A A^T, A = R(q)
 // diag(exp(s)):

@@ -9,9 +9,8 @@
 //            places are all that the sender needs to find its splats' gradients again.
 //   gather:  the groups that arrived, one after the other -> columns.
 //   sum:     values [S, F] of each group -> columns [P, w], the sum over the groups of each splat in the
-//   order
-//            of ranks, starting from zero: deterministic. On CUDA the values may be in the memory of the GPUs
-//            that composited the splats.
+//            order of ranks, starting from zero: deterministic. On CUDA the values may be in the memory of
+//            the GPUs that composited the splats.
 //
 // The cost is O(words moved). Splats beyond the given size of a group are dropped, whatever the masks say.
 #pragma once
