@@ -111,7 +111,7 @@ def run(args: argparse.Namespace) -> None:
             # Standard output has nothing but the JSON.
             for view, psnr in worst_views(result["views"]):
                 print(printable(f"among the worst views: {view} {psnr:.2f} dB"), file=sys.stderr)
-            what = f"metrics.json and pictures of {len(indices)} views, {largest_size(capture)} pixels"
+            what = f"metrics.json and pictures; {len(indices)} views, {largest_size(capture)} pixels"
             print(f"{folder}: {what}", file=sys.stderr)
 
 

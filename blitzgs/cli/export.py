@@ -227,6 +227,8 @@ def _export_html(args: argparse.Namespace) -> None:
     print(f"{path}: {page.gaussians:,} of {page.of:,} Gaussians, {size:.1f} MB; open it in a browser")
     if page.left_out:
         print(page.left_out)
+    elif page.gaussians < page.of:
+        print("the other Gaussians are too faint to be seen")
 
 
 def _export_file(args: argparse.Namespace) -> None:

@@ -92,7 +92,7 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
     arguments.add_flags(parser, FLAGS, {"--size": _size, "--fps": _POSITIVE, "--seconds": _POSITIVE})
 
 
-_OTHER_FILMS = (".gif", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".webp")
+_OTHER_FILES = (".gif", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".webp", ".png", ".jpg", ".jpeg")
 
 
 def run(args: argparse.Namespace) -> None:
@@ -115,7 +115,7 @@ def run(args: argparse.Namespace) -> None:
 def _film(args: argparse.Namespace) -> Film | None:
     """Return what --path asks for; None: the command has no --path."""
     is_film = args.out.suffix.lower() == SUFFIX
-    if args.out.suffix.lower() in _OTHER_FILMS:
+    if args.out.suffix.lower() in _OTHER_FILES:
         raise ValueError(f"{args.out}: a film's name ends in {SUFFIX}, and pictures need a folder")
     if args.path is None:
         for name in ("size", "fps", "seconds", "dataparser"):

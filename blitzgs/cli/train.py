@@ -296,14 +296,19 @@ def _print_summary(summary: dict[str, object], folder: Path) -> None:
     console.print(table)
     # Quoted, so that the commands can be copied.
     name = shlex.quote(str(folder))
+    split, views = ("--split train ", "training") if summary.get("split") == "train" else ("", "held-out")
+    commands = {
+        f"view {name}": "the model in the browser",
+        f"render {name} {split}--out PICTURES": f"the {views} views as pictures",
+        f"export {name} --ply MODEL.ply": "the model for viewers",
+        f"train --out {name} --extend 1.5": "train half as long again",
+    }
+    width = max(map(len, commands))
     for text in (
         f"report: {folder / run_files.REPORT}",
         f"pictures: {folder / run_files.EVALUATION}",
         "next:",
-        f"  blitzgs view {name}                       the model in the browser",
-        f"  blitzgs render {name} --out PICTURES      the held-out views as pictures",
-        f"  blitzgs export {name} --ply MODEL.ply     the model for viewers",
-        f"  blitzgs train --out {name} --extend 1.5   train half as long again",
+        *(f"  blitzgs {command:{width}}   {what}" for command, what in commands.items()),
     ):
         console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
 

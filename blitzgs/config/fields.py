@@ -151,7 +151,7 @@ class ScheduleConfig:
         iterations: length of the run.
         scale: stretches or compresses the whole schedule without changing its shape.
         images_per_view: how often a new run sees each training view on average, at least: it multiplies
-            `scale` by the factor that is needed for this, from 1 to `MAX_STRETCH`. The run's own
+            `scale` by the factor that is needed for this, from 1 to 10. The run's own
             configuration has the product in `scale`, and 0 here. With 0 or with `minutes` the length does not
             depend on the number of views.
         minutes: wall time of training that the schedule is fitted into (`--minutes`): the run

@@ -40,7 +40,9 @@ class Selection:
             met &= block.opacities.sigmoid() >= self.min_opacity
         if self.levels is not None:
             if block.levels is None:
-                raise ValueError("the model has no octree levels: train it with view.lod=true")
+                raise ValueError(
+                    "the model has no octree levels: view.lod was off, or left nothing out of any view"
+                )
             met &= (block.levels >= self.levels[0]) & (block.levels <= self.levels[1])
         if self.box is not None or self.polygon is not None:
             places = block.means.double().numpy() + origin

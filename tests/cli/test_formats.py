@@ -61,7 +61,7 @@ def test_a_file_is_measured_as_its_run(trained, whole, tmp_path, capsys, failure
     # The file's positions are rounded to float32 away from the origin.
     assert file["psnr"] == pytest.approx(run["psnr"], abs=0.02)
     assert main(["eval", str(whole), *flags, "--downscale=2"]) == 0
-    assert "pictures of 1 views, 24 x 16 pixels" in capsys.readouterr().err
+    assert "pictures; 1 views, 24 x 16 pixels" in capsys.readouterr().err
     assert "add --data CAPTURE" in failure("eval", whole)
     far = read_gaussians(whole)
     write_ply(tmp_path / "far.ply", **vars(dataclasses.replace(far, means=far.means + 1e5)))

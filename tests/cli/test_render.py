@@ -166,6 +166,7 @@ def test_a_ply_file_has_no_cameras_of_its_own(trained, tmp_path, failure):
         (["--fps", "3", "--out", "d"], "--fps needs --path"),
         (["--path", "orbit", "--depth", "--out", "f.mp4"], "give a folder as --out"),
         (["--path", "orbit", "--out", "f.gif"], "a film's name ends in .mp4"),
+        (["--out", "f.png"], "pictures need a folder"),
         (["--path", "orbit", "--size", "31x20", "--out", "f.mp4"], "even sides, got 31x20"),
         (["--path", "orbit", "--exposure", "--out", "d"], "--exposure and --path exclude each other"),
         (["--path", "nowhere.json", "--out", "d"], "there is no such file; orbit, flight, spline need none"),

@@ -56,7 +56,7 @@ def test_eval_repeats_the_metrics_of_training(trained, tmp_path, capsys):
     assert main(["eval", str(trained[1]), "--out", str(tmp_path), "--pictures", "1", "--share-gpus"]) == 0
     printed = capsys.readouterr()
     assert json.loads(printed.out) == {name: summary[name] for name in ("psnr", "ssim", "psnr_corrected")}
-    assert f"{tmp_path}: metrics.json and pictures" in printed.err
+    assert f"{tmp_path}: metrics.json and pictures; " in printed.err
     assert [path.name for path in tmp_path.glob("*.jpg")] == ["00.jpg"]
     out = tmp_path / "all"
     assert main(["eval", str(trained[1]), "--split", "all", "--pictures=0", "--out", str(out)]) == 0
@@ -210,6 +210,7 @@ def test_figures_of_training_views_are_called_so(trained, tmp_path, capsys, fail
     shown, summary = capsys.readouterr().out, json.loads((tmp_path / "run" / "summary.json").read_text())
     assert "evaluation of TRAINING views (none is held out)" in shown and summary["split"] == "train"
     assert "no view is held out: the figures are those of the training views" in shown
+    assert f"blitzgs render {tmp_path / 'run'} --split train --out PICTURES" in shown
     assert "no test views: choose another --split" in failure("eval", tmp_path / "run")
 
 

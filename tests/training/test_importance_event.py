@@ -155,6 +155,18 @@ def test_the_second_pass_keeps_at_most_a_share(tmp_path):
     assert second["gaussians"] == second["before"] // 2
 
 
+def test_a_pass_says_what_it_keeps(tmp_path, capsys):
+    flags = ("population.pass1_keep=1", "population.pass2_mass=1", "population.pass2_keep=0.5")
+    train(tmp_path / "half", *flags)
+    second = pass_events(tmp_path / "half")["pass_2"]
+    kept = f"the importance pass keeps {second['gaussians']:,} of {second['before']:,} Gaussians"
+    out = capsys.readouterr().out
+    assert kept in out and out.count("the importance pass") == 1
+    train(tmp_path / "few", *flags, "population.pass2_views=8")
+    few = "keeps all Gaussians: 7 training views are fewer than population.pass2_views (8)"
+    assert few in capsys.readouterr().out
+
+
 def test_phi_weighs_the_gradients_from_the_first_pass_on(tmp_path):
     sums = {}
     for phi in ("true", "false"):

@@ -180,6 +180,14 @@ def test_a_run_and_its_checkpoints_are_exported(browser, trained, tmp_path, caps
     assert browser.errors() == []
 
 
+def test_gaussians_that_no_view_shows_are_counted(tmp_path, capsys):
+    write_model(tmp_path / "m.ply")
+    assert main(["export", str(tmp_path / "m.ply"), "--html", str(tmp_path / "m.html")]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"m.html: 2,99\d of 3,000 Gaussians", printed)
+    assert "the other Gaussians are too faint to be seen" in printed
+
+
 def test_of_a_large_model_the_largest_gaussians_are_read(trained, tmp_path, monkeypatch, capsys):
     whole = open_model(trained[1], Ranks())
     ply, page = tmp_path / "a.ply", tmp_path / "a.html"

@@ -56,7 +56,7 @@ def run_importance_pass(state: TrainingState, event: Event) -> None:
     state.progress.sorted_spread = 0
     view_level.choose_views(state)
     counts = {"before": before, "gaussians": after, "views": views}
-    state.log.event(event.time, event.kind, counts)
+    state.log.event(event.time, event.kind, counts, _described(state, event, before, after))
 
 
 def _surveyed(state: TrainingState, views: int) -> Importance:
@@ -74,6 +74,18 @@ def _surveyed(state: TrainingState, views: int) -> Importance:
             subject.lod,
             state.stops,
         )
+
+
+def _described(state: TrainingState, event: Event, before: int, after: int) -> str | None:
+    """Return in words how many Gaussians a pass kept; None: all, as the configuration says."""
+    if after < before:
+        return f"the importance pass keeps {after:,} of {before:,} Gaussians"
+    population, views = state.config.population, len(state.capture.train)
+    prunes = min(population.pass2_mass, population.pass2_keep) < 1
+    if event.kind == "pass_2" and prunes and views < population.pass2_views:
+        few = f"{views} training views are fewer than population.pass2_views ({population.pass2_views})"
+        return f"the importance pass keeps all Gaussians: {few}"
+    return None
 
 
 def _keeps_all(state: TrainingState, event: Event) -> bool:
