@@ -33,20 +33,20 @@ COMMANDS = {
     "render": "python benchmarks/bm_render.py",
     "step_1": "python benchmarks/bm_step.py --views 1",
     "step_4": "python benchmarks/bm_step.py --views 4",
-    "accuracy": "python benchmarks/bm_accuracy.py",
+    "accuracy": "python benchmarks/bm_accuracy.py --exact-library build-exact/lib",
     "offload": "python benchmarks/bm_offload.py --ratios 2 4",
     "exchange": (
         "python benchmarks/bm_exchange.py --gaussians 16000000 --device cuda --batch 4 16 --batches 3 "
         "--ranks 1 2 4"
     ),
-    "drop_in_full": "python benchmarks/bm_drop_in.py CAPTURE --steps 30000 --one-thread",
+    "drop_in_full": ("python benchmarks/bm_drop_in.py CAPTURE --steps 30000 --arms four gsplat --one-thread"),
     "quality": (
         "python benchmarks/bm_quality.py --out runs/quality --capture NAME=CAPTURE "
         "--recipe aerial=configs/aerial.yaml --recipe compact=configs/compact.yaml --seeds 0 1 2"
     ),
-    "city": "python benchmarks/bm_city.py CITY --out RESULTS --gpus 2 --ranks 1 --popping --scale 0.6",
+    "city": ("python benchmarks/bm_city.py CITY --out runs/city --popping --scale 5 --seconds-per-run 400"),
     "city_ranks": (
-        "python benchmarks/bm_city.py CITY --out RESULTS --gpus 4 --ranks 1 4 --arms all_off "
+        "python benchmarks/bm_city.py CITY --out runs/city_ranks --ranks 1 2 4 --arms all_off "
         "--batch-sizes 16 --scale 13.85 --seconds-per-run 540"
     ),
 }

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import gpu_record
 import harness
+import measure
 import pytest
 import report
 import report_tables
@@ -42,6 +43,33 @@ def test_the_exchange_benchmark_writes_what_the_report_reads(tmp_path):
     assert f"`python benchmarks/bm_exchange.py {flags}`" in page and "commit abc" in page
     for line in ("| project | ", "| optimiser | ", "| **steps in a row** | ", "| MB between ranks | 0 |"):
         assert f"\n{line}" in page
+
+
+def measure_with(monkeypatch, tmp_path, flags):
+    tiny = f"python benchmarks/bm_exchange.py {flags}"
+    monkeypatch.setattr(measure, "COMMANDS", {"exchange": tiny, "quality": "python CAPTURE", "step_1": ""})
+    gpus = {"exchange": 0, "quality": 0, "step_1": 4}
+    monkeypatch.setattr(measure, "PLAN", tuple(measure.Job(*job) for job in gpus.items()))
+    monkeypatch.setenv("BLITZGS_COMMIT", "abc")
+    folders = ["--work", str(tmp_path / "work"), "--results", str(tmp_path / "results")]
+    return measure.main([*folders, "--gpus", "0", "--only", "exchange", "quality", "step_1"])
+
+
+def test_one_command_measures_what_it_can_and_continues(tmp_path, monkeypatch, capsys):
+    assert measure_with(monkeypatch, tmp_path, "--device cpu --no-such-flag") == 1
+    printed = capsys.readouterr().out
+    assert f"exchange: FAILED, see {tmp_path}/work/exchange.log" in printed
+    assert (
+        "quality: not measured, needs a capture" in printed
+        and "step_1: not measured, needs 4 GPUs" in printed
+    )
+    assert "no-such-flag" in (tmp_path / "work" / "exchange.log").read_text()
+    good = "--gaussians 2000 --ranks 1 --batch 1 --batches 1 --visits 1 --device cpu"
+    measure_with(monkeypatch, tmp_path, good)
+    assert "exchange: done" in capsys.readouterr().out
+    assert json.loads((tmp_path / "results" / "exchange.json").read_text())["commit"] == "abc"
+    measure_with(monkeypatch, tmp_path, good)
+    assert "exchange" not in capsys.readouterr().out
 
 
 def test_the_commit_is_that_of_the_checkout(monkeypatch):
