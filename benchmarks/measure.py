@@ -5,10 +5,10 @@
     python benchmarks/measure.py --work WORK --city CITY --capture sheffield=DIR --capture caliterra=DIR ...
     python benchmarks/report.py
 
-Runs the commands of `report.py`, each on GPUs of its own, and those that compare numbers of GPUs at last,
-with the machine to themselves. The first capture is the one of gsplat's training loop. WORK gets the runs and
-a log of each command. What has been measured at this commit is skipped, and so are commands that need more
-GPUs than there are. The GPU tests are not part of it (`make gpu-record`).
+Runs the commands of `report.py`, each on GPUs of its own. The arms of the city run together, and commands
+that compare numbers of GPUs have the machine to themselves, at last. The first capture is the one of gsplat's
+training loop. WORK gets the runs and a log of each command. What has been measured at this commit is skipped,
+and so are commands that need more GPUs than there are. The GPU tests are not part of it (`make gpu-record`).
 """
 
 from __future__ import annotations
@@ -48,8 +48,9 @@ class Job:
 # Long jobs first. The parts of `city_ranks` are runs that the whole command then finds done.
 PLAN = (
     Job("city_ranks", 1, "--ranks 1"), Job("quality", 2), Job("drop_in_full", 1),
-    Job("city_ranks", 2, "--ranks 2"), Job("city", 2), Job("offload", 1), Job("render", 1),
-    Job("step_1", 1), Job("step_4", 1), Job("accuracy", 1), Job("city_ranks", 4), Job("exchange", 4),
+    Job("city_ranks", 2, "--ranks 2"), Job("offload", 1), Job("render", 1),
+    Job("step_1", 1), Job("step_4", 1), Job("accuracy", 1), Job("city", 4), Job("city_ranks", 4),
+    Job("exchange", 4),
 )  # fmt: skip
 
 
@@ -88,8 +89,11 @@ def run_all(jobs: list[Job], gpus: int, work: Path, captures: dict[str, str], re
     running: list[tuple[Job, list[int], subprocess.Popen[bytes], float]] = []
     paths = [str(harness.ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {
-        "BLITZGS_COMMIT": harness.commit(), "PYTHONUNBUFFERED": "1", "PYTHONPATH": os.pathsep.join(paths),
-    }  # fmt: skip
+        "BLITZGS_COMMIT": harness.commit(),
+        "OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // max(gpus, 1))),
+        "PYTHONPATH": os.pathsep.join(paths),
+        "PYTHONUNBUFFERED": "1",
+    }
     while jobs or running:
         while jobs and jobs[0].gpus <= len(free):
             job = jobs.pop(0)
