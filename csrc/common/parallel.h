@@ -3,6 +3,7 @@
 // the torch thread pool (parallel_torch.cpp), so torch.set_num_threads applies to the kernels. The Catch2
 // tests link plain threads (parallel_std.cpp).
 #pragma once
+#include <algorithm>
 #include <atomic>
 #include <cstdint>
 #include <cstdlib>
@@ -32,6 +33,13 @@ void parallel_rows(std::int64_t n, std::int64_t grain, const F& f) {
   parallel_for(0, n, grain, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t i = begin; i < end; ++i) f(i);
   });
+}
+
+// Sets n values to zero.
+template <class T>
+void parallel_zero(T* values, std::int64_t n) {
+  parallel_for(0, n, 1 << 16,
+               [&](std::int64_t begin, std::int64_t end) { std::fill(values + begin, values + end, T(0)); });
 }
 
 // Calls f(task, worker) once for each task in [0, n). Each worker takes one task at a time, which suits tasks

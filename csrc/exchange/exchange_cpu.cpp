@@ -13,14 +13,17 @@ void scatter(const ScatterSplats& splats, const SplatGroups& groups, const Scatt
              SplatPlace* places, Workspace&, CudaStream) {
   const int n_ranks = groups.count;
   const std::int64_t runs = place_runs(splats.count);
-  parallel_for(0, runs, 256, [&](std::int64_t begin, std::int64_t end) {
-    std::fill(places + begin * n_ranks, places + end * n_ranks, SplatPlace{});
-    for (std::int64_t splat = begin * kPlaceSplats; splat < std::min(splats.count, end * kPlaceSplats);
-         ++splat) {
-      SplatPlace* run = places + splat / kPlaceSplats * n_ranks;
-      for (int m = 0; m < n_ranks; ++m) {
-        run[m].bits |= static_cast<std::uint32_t>((splats.masks[splat] >> m) & 1) << splat % kPlaceSplats;
-      }
+  // Calls f(places of a run, splat) for the splats of each run.
+  const auto for_each_splat = [&](const auto& f) {
+    parallel_rows(runs, 256, [&](std::int64_t run) {
+      const std::int64_t begin = run * kPlaceSplats, end = std::min(splats.count, begin + kPlaceSplats);
+      for (std::int64_t splat = begin; splat < end; ++splat) f(places + run * n_ranks, splat);
+    });
+  };
+  std::fill_n(places, runs * n_ranks, SplatPlace{});
+  for_each_splat([&](SplatPlace* run, std::int64_t splat) {
+    for (int m = 0; m < n_ranks; ++m) {
+      run[m].bits |= static_cast<std::uint32_t>((splats.masks[splat] >> m) & 1) << splat % kPlaceSplats;
     }
   });
   for (int m = 0; m < n_ranks; ++m) {
@@ -31,18 +34,14 @@ void scatter(const ScatterSplats& splats, const SplatGroups& groups, const Scatt
       before += count_bits(place.bits);
     }
   }
-  parallel_for(0, runs, 256, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t splat = begin * kPlaceSplats; splat < std::min(splats.count, end * kPlaceSplats);
-         ++splat) {
-      const SplatPlace* run = places + splat / kPlaceSplats * n_ranks;
-      for (int m = 0; m < n_ranks; ++m) {
-        const auto in_run = static_cast<std::uint32_t>(splat % kPlaceSplats);
-        const std::int64_t at = run[m].of(in_run);
-        if (!run[m].has(in_run) || at >= groups.size[m]) continue;
-        for (int c = 0; c < splats.columns.count; ++c) {
-          const std::int64_t width = splats.columns.begin[c + 1] - splats.columns.begin[c];
-          std::memcpy(targets.words[m][c] + at * width, splats.columns.data[c] + splat * width, 4 * width);
-        }
+  for_each_splat([&](const SplatPlace* run, std::int64_t splat) {
+    const auto in_run = static_cast<std::uint32_t>(splat % kPlaceSplats);
+    for (int m = 0; m < n_ranks; ++m) {
+      const std::int64_t at = run[m].of(in_run);
+      if (!run[m].has(in_run) || at >= groups.size[m]) continue;
+      for (int c = 0; c < splats.columns.count; ++c) {
+        const std::int64_t width = splats.columns.begin[c + 1] - splats.columns.begin[c];
+        std::memcpy(targets.words[m][c] + at * width, splats.columns.data[c] + splat * width, 4 * width);
       }
     }
   });

@@ -40,12 +40,12 @@ void for_each_span(const IntersectInput<T>& in, std::int32_t splat, const F& f) 
                     });
 }
 
-// The begin of piece number `piece` of [0, n), divided into `pieces` parts of nearly equal length.
-std::int64_t piece_start(std::int64_t n, int pieces, int piece) { return n * piece / pieces; }
-
+// Calls f(piece, begin, end) for [0, n) in `pieces` pieces of nearly equal length.
 template <class F>
-void parallel_pieces(int pieces, const F& f) {
-  parallel_rows(pieces, 1, [&](std::int64_t piece) { f(static_cast<int>(piece)); });
+void parallel_pieces(std::int64_t n, int pieces, const F& f) {
+  parallel_rows(pieces, 1, [&](std::int64_t piece) {
+    f(static_cast<int>(piece), n * piece / pieces, n * (piece + 1) / pieces);
+  });
 }
 
 // One stable counting pass on 11 bits. Returns false and moves nothing when all keys have the same 11 bits.
@@ -55,11 +55,9 @@ bool radix_pass(const Keyed<Key>* from, Keyed<Key>* to, std::int64_t n, int shif
   const int pieces = num_threads();
   const auto bucket_of = [shift](Key key) { return static_cast<int>(key >> shift) & (kBuckets - 1); };
   std::vector<std::array<std::int64_t, kBuckets>> places(pieces);
-  parallel_pieces(pieces, [&](int piece) {
+  parallel_pieces(n, pieces, [&](int piece, std::int64_t begin, std::int64_t end) {
     places[piece].fill(0);
-    const std::int64_t end = piece_start(n, pieces, piece + 1);
-    for (std::int64_t i = piece_start(n, pieces, piece); i < end; ++i)
-      ++places[piece][bucket_of(from[i].key)];
+    for (std::int64_t i = begin; i < end; ++i) ++places[piece][bucket_of(from[i].key)];
   });
   std::int64_t place = 0;
   for (int bucket = 0; bucket < kBuckets; ++bucket) {
@@ -71,11 +69,8 @@ bool radix_pass(const Keyed<Key>* from, Keyed<Key>* to, std::int64_t n, int shif
     }
     if (place - start == n) return false;
   }
-  parallel_pieces(pieces, [&](int piece) {
-    const std::int64_t end = piece_start(n, pieces, piece + 1);
-    for (std::int64_t i = piece_start(n, pieces, piece); i < end; ++i) {
-      to[places[piece][bucket_of(from[i].key)]++] = from[i];
-    }
+  parallel_pieces(n, pieces, [&](int piece, std::int64_t begin, std::int64_t end) {
+    for (std::int64_t i = begin; i < end; ++i) to[places[piece][bucket_of(from[i].key)]++] = from[i];
   });
   return true;
 }
@@ -102,9 +97,8 @@ const Keyed<KeyOf<T>>* sort_splats(const IntersectInput<T>& in, Workspace& works
   using Key = KeyOf<T>;
   auto* splats = workspace.allocate<Keyed<Key>>(in.n_splats);
   auto* spare = workspace.allocate<Keyed<Key>>(in.n_splats);
-  parallel_for(0, in.n_splats, 1 << 14, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t i = begin; i < end; ++i)
-      splats[i] = {ordered_bits(in.depths[i]), static_cast<std::int32_t>(i)};
+  parallel_rows(in.n_splats, 1 << 14, [&](std::int64_t i) {
+    splats[i] = {ordered_bits(in.depths[i]), static_cast<std::int32_t>(i)};
   });
   for (int shift = 0; shift < static_cast<int>(8 * sizeof(Key)); shift += 11) {
     if (radix_pass(splats, spare, in.n_splats, shift)) std::swap(splats, spare);
@@ -147,11 +141,9 @@ std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::
   const int pieces = choose_pieces(n_tiles);
   auto* places = workspace.allocate<std::int64_t>(n_tiles * pieces);
   std::vector<std::vector<Span>> spans(pieces);
-  parallel_pieces(pieces, [&](int piece) {
+  parallel_pieces(in.n_splats, pieces, [&](int piece, std::int64_t begin, std::int64_t end) {
     std::int64_t* counts = places + n_tiles * piece;
     std::fill_n(counts, n_tiles, 0);
-    const std::int64_t begin = piece_start(in.n_splats, pieces, piece);
-    const std::int64_t end = piece_start(in.n_splats, pieces, piece + 1);
     spans[piece].reserve(2 * (end - begin));
     for (std::int64_t i = begin; i < end; ++i) {
       // Splats in depth order are scattered in memory, so a few splats are prefetched.
@@ -182,7 +174,7 @@ std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::
   if (place > capacity) return place;
 
   // Then each piece writes its part of every list.
-  parallel_pieces(pieces, [&](int piece) {
+  parallel_rows(pieces, 1, [&](std::int64_t piece) {
     std::int64_t* next = places + n_tiles * piece;
     for (const Span& span : spans[piece]) {
       for (std::int32_t tile = 0; tile < span.count; ++tile)

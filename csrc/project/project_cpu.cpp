@@ -243,11 +243,7 @@ void project_bwd(const ProjectInputs<T>& in, const SplatIndex& splats, const Spl
 
 template <class T>
 void zero_arrays(const ZeroedArrays<T>& arrays, CudaStream) {
-  for (int a = 0; a < ZeroedArrays<T>::kCount; ++a) {
-    parallel_for(0, arrays.length[a], 1 << 16, [&](std::int64_t begin, std::int64_t end) {
-      std::fill(arrays.begin[a] + begin, arrays.begin[a] + end, T(0));
-    });
-  }
+  for (int a = 0; a < ZeroedArrays<T>::kCount; ++a) parallel_zero(arrays.begin[a], arrays.length[a]);
 }
 
 #define BLITZGS_INSTANTIATE(T)                                                                              \

@@ -28,17 +28,15 @@ void clear_unowned(const RasterizeInput<T>& in, const RasterizeOutput<T>& out) {
 // Writes to used [owned tiles] the length of each owned tile's list up to its last composited entry.
 template <class T>
 void find_used_entries(const RasterizeInput<T>& in, const std::int32_t* last_ids, std::int32_t* used) {
-  const TileGrid& grid = in.grid;
-  parallel_for(grid.tile_begin, grid.tile_end, 8, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t tile = begin; tile < end; ++tile) {
-      const TileJob<T> job = make_job<T>(in, nullptr, tile);
-      std::int32_t most = 0;
-      for (int row = 0; row < job.height; ++row) {
-        const std::int32_t* last = last_ids + job.first_pixel + static_cast<std::int64_t>(row) * grid.width;
-        for (int x = 0; x < job.width; ++x) most = std::max(most, last[x]);
-      }
-      used[tile - grid.tile_begin] = most;
+  parallel_rows(in.grid.tile_end - in.grid.tile_begin, 8, [&](std::int64_t owned) {
+    const TileJob<T> job = make_job<T>(in, nullptr, in.grid.tile_begin + owned);
+    std::int32_t most = 0;
+    for (int row = 0; row < job.height; ++row) {
+      const std::int32_t* last =
+          last_ids + job.first_pixel + static_cast<std::int64_t>(row) * job.image_width;
+      for (int x = 0; x < job.width; ++x) most = std::max(most, last[x]);
     }
+    used[owned] = most;
   });
 }
 
@@ -142,9 +140,7 @@ void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, 
   for (const Chunk& chunk : chunks) most = std::max(most, chunk.partials);
   auto* partials = workspace.allocate<T>(most * width);
   auto* sums = workspace.allocate<T>(in.n_splats * width);
-  parallel_for(0, in.n_splats * width, 1 << 16,
-               [&](std::int64_t begin, std::int64_t end) { std::fill(sums + begin, sums + end, T(0)); });
-
+  parallel_zero(sums, in.n_splats * width);
   const PreparedSplat<T>* splats = sizeof(T) == 4
                                        ? static_cast<const PreparedSplat<T>*>(aux.packed)
                                        : pack_splats(in, allocate_splats<T>(in.n_splats, workspace));
