@@ -146,9 +146,16 @@ const T* splat_color(const TileJob<T>& tile, std::int32_t index) {
   return tile.colors + static_cast<std::int64_t>(index) * channels<D>(tile);
 }
 
-template <class T>
-void pixel_centres(const TileJob<T>& tile, int stride, T* centres) {
-  for (int x = 0; x < stride; ++x) centres[x] = static_cast<T>(tile.x0 + x) + T(0.5);
+// The state of a tile's pixels in its memory: planes of zeros, and the pixel centres of a row.
+template <class State, class T>
+State start_planes(const TileJob<T>& tile, int n_channels) {
+  const PlaneLayout layout(tile.tile_size);
+  const std::ptrdiff_t plane = layout.plane, used = plane * (2 + n_channels);
+  T* memory = tile.memory;
+  std::fill_n(memory, used, T(0));
+  std::fill_n(tile.last_memory, plane, 0);
+  for (int x = 0; x < layout.stride; ++x) memory[used + x] = static_cast<T>(tile.x0 + x) + T(0.5);
+  return {layout, memory, memory + plane, memory + 2 * plane, memory + used, tile.last_memory};
 }
 
 template <class T>
@@ -162,18 +169,12 @@ struct ForwardState {
 
 template <int D, class T>
 ForwardState<T> start_forward(const TileJob<T>& tile) {
-  const PlaneLayout layout(tile.tile_size);
-  const std::ptrdiff_t plane = layout.plane, used = plane * (2 + channels<D>(tile));
-  T* memory = tile.memory;
-  ForwardState<T> state{layout, memory, memory + plane, memory + 2 * plane, memory + used, tile.last_memory};
-  std::fill_n(memory, used, T(0));
-  std::fill_n(state.last, plane, 0);
+  auto state = start_planes<ForwardState<T>>(tile, channels<D>(tile));
   for (int row = 0; row < tile.height; ++row) {
-    std::fill_n(state.transmittance + row * layout.stride, tile.width, T(1));
+    std::fill_n(state.transmittance + row * state.layout.stride, tile.width, T(1));
     state.alive_in_row[row] = tile.width;
     state.alive_rows |= std::uint64_t{1} << row;
   }
-  pixel_centres(tile, layout.stride, state.centres);
   return state;
 }
 

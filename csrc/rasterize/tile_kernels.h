@@ -30,16 +30,11 @@ struct BackwardState {
 
 template <int D, class T>
 BackwardState<T> start_backward(const TileJob<T>& tile) {
-  const PlaneLayout layout(tile.tile_size);
   const int n_channels = channels<D>(tile);
-  const std::ptrdiff_t plane = layout.plane, used = plane * (2 + n_channels);
-  T* memory = tile.memory;
-  BackwardState<T> state{layout, memory, memory + plane, memory + 2 * plane, memory + used, tile.last_memory};
-  std::fill_n(memory, used, T(0));
-  std::fill_n(state.last, plane, 0);
+  auto state = start_planes<BackwardState<T>>(tile, n_channels);
   for (int row = 0; row < tile.height; ++row) {
     for (int x = 0; x < tile.width; ++x) {
-      const int pixel = row * layout.stride + x;
+      const int pixel = row * state.layout.stride + x;
       const std::int64_t in = tile.first_pixel + static_cast<std::int64_t>(row) * tile.image_width + x;
       state.transmittance[pixel] = tile.saved.transmittances[in];
       state.last[pixel] = tile.saved.last_ids[in];
@@ -50,13 +45,12 @@ BackwardState<T> start_backward(const TileJob<T>& tile) {
       T behind = tile.saved.v_alphas ? -tile.saved.v_alphas[in] : T(0);
       for (int c = 0; c < n_channels; ++c) {
         const T v = tile.saved.v_renders[in * n_channels + c];
-        state.v_render[c * plane + pixel] = v;
+        state.v_render[c * state.layout.plane + pixel] = v;
         if (tile.background) behind += tile.background[c] * v;
       }
       state.behind[pixel] = behind;
     }
   }
-  pixel_centres(tile, layout.stride, state.centres);
   return state;
 }
 
