@@ -9,6 +9,7 @@
 #include <bit>
 #include <cmath>
 #include <cstdint>
+#include <functional>
 
 #ifdef __AVX2__
 #include <immintrin.h>
@@ -19,52 +20,48 @@ namespace {
 
 constexpr int kLanes = 8;
 
+// Eight values, of lane i f(i).
+template <class Eight, class F>
+Eight make_eight(F f) {
+  Eight r;
+  for (int i = 0; i < kLanes; ++i) r.v[i] = f(i);
+  return r;
+}
+
+// Eight values, f of those of each lane.
+template <class Eight, class F, class... Lanes>
+Eight map_eight(F f, Lanes... lanes) {
+  return make_eight<Eight>([&](int i) { return f(lanes.v[i]...); });
+}
+
 template <class T>
 struct PlainLanes {
   using Scalar = T;
   struct Mask {
     bool v[kLanes];
-    friend Mask operator&(Mask a, Mask b) {
-      return make([&](int i) { return a.v[i] && b.v[i]; });
-    }
-    Mask and_not(Mask b) const {  // this and not b
-      return make([&](int i) { return v[i] && !b.v[i]; });
-    }
+    friend Mask operator&(Mask a, Mask b) { return map_eight<Mask>(std::logical_and<>(), a, b); }
+    Mask and_not(Mask b) const { return map_eight<Mask>(std::greater<>(), *this, b); }  // this and not b
     bool any() const { return bits() != 0; }
     unsigned bits() const {
       unsigned result = 0;
       for (int i = 0; i < kLanes; ++i) result |= static_cast<unsigned>(v[i]) << i;
       return result;
     }
-    template <class F>
-    static Mask make(F f) {
-      Mask m;
-      for (int i = 0; i < kLanes; ++i) m.v[i] = f(i);
-      return m;
-    }
   };
   struct Int {
     std::int32_t v[kLanes];
     static Int load(const std::int32_t* p) {
-      Int r;
-      for (int i = 0; i < kLanes; ++i) r.v[i] = p[i];
-      return r;
+      return make_eight<Int>([&](int i) { return p[i]; });
     }
     void store(std::int32_t* p) const {
       for (int i = 0; i < kLanes; ++i) p[i] = v[i];
     }
     static Int broadcast(std::int32_t x) {
-      Int r;
-      for (int i = 0; i < kLanes; ++i) r.v[i] = x;
-      return r;
+      return make_eight<Int>([&](int) { return x; });
     }
-    static Mask greater(Int a, Int b) {
-      return Mask::make([&](int i) { return a.v[i] > b.v[i]; });
-    }
+    static Mask greater(Int a, Int b) { return map_eight<Mask>(std::greater<>(), a, b); }
     static Int select(Mask m, Int a, Int b) {
-      Int r;
-      for (int i = 0; i < kLanes; ++i) r.v[i] = m.v[i] ? a.v[i] : b.v[i];
-      return r;
+      return make_eight<Int>([&](int i) { return m.v[i] ? a.v[i] : b.v[i]; });
     }
   };
 
@@ -72,10 +69,13 @@ struct PlainLanes {
 
   template <class F>
   static PlainLanes make(F f) {
-    PlainLanes r;
-    for (int i = 0; i < kLanes; ++i) r.v[i] = f(i);
-    return r;
+    return make_eight<PlainLanes>(f);
   }
+  template <class F>
+  static PlainLanes map(F f, PlainLanes a, PlainLanes b) {
+    return map_eight<PlainLanes>(f, a, b);
+  }
+  static PlainLanes map(T (*f)(T), PlainLanes a) { return map_eight<PlainLanes>(f, a); }
   static PlainLanes load(const T* p) {
     return make([&](int i) { return p[i]; });
   }
@@ -89,25 +89,17 @@ struct PlainLanes {
   static PlainLanes iota() {
     return make([](int i) { return static_cast<T>(i); });
   }
-  friend PlainLanes operator+(PlainLanes a, PlainLanes b) {
-    return make([&](int i) { return a.v[i] + b.v[i]; });
-  }
-  friend PlainLanes operator-(PlainLanes a, PlainLanes b) {
-    return make([&](int i) { return a.v[i] - b.v[i]; });
-  }
-  friend PlainLanes operator*(PlainLanes a, PlainLanes b) {
-    return make([&](int i) { return a.v[i] * b.v[i]; });
-  }
-  friend PlainLanes operator/(PlainLanes a, PlainLanes b) {
-    return make([&](int i) { return a.v[i] / b.v[i]; });
-  }
+  friend PlainLanes operator+(PlainLanes a, PlainLanes b) { return map(std::plus<>(), a, b); }
+  friend PlainLanes operator-(PlainLanes a, PlainLanes b) { return map(std::minus<>(), a, b); }
+  friend PlainLanes operator*(PlainLanes a, PlainLanes b) { return map(std::multiplies<>(), a, b); }
+  friend PlainLanes operator/(PlainLanes a, PlainLanes b) { return map(std::divides<>(), a, b); }
   // In float64 there is no vector version with the same bits, so the plain expression is enough.
   static T fma1(T a, T b, T c) {
     if constexpr (sizeof(T) == 4) return std::fma(a, b, c);
     return a * b + c;
   }
   static PlainLanes fma(PlainLanes a, PlainLanes b, PlainLanes c) {
-    return make([&](int i) { return fma1(a.v[i], b.v[i], c.v[i]); });
+    return map_eight<PlainLanes>(fma1, a, b, c);
   }
   static PlainLanes fnma(PlainLanes a, PlainLanes b, PlainLanes c) {  // c - a b
     return make([&](int i) { return fma1(-a.v[i], b.v[i], c.v[i]); });
@@ -118,21 +110,11 @@ struct PlainLanes {
   static PlainLanes max(PlainLanes a, PlainLanes b) {
     return make([&](int i) { return a.v[i] > b.v[i] ? a.v[i] : b.v[i]; });
   }
-  static PlainLanes sqrt(PlainLanes a) {
-    return make([&](int i) { return std::sqrt(a.v[i]); });
-  }
-  static PlainLanes abs(PlainLanes a) {
-    return make([&](int i) { return std::fabs(a.v[i]); });
-  }
-  static PlainLanes round(PlainLanes a) {
-    return make([&](int i) { return std::nearbyint(a.v[i]); });
-  }
-  static PlainLanes ceil(PlainLanes a) {
-    return make([&](int i) { return std::ceil(a.v[i]); });
-  }
-  static PlainLanes floor(PlainLanes a) {
-    return make([&](int i) { return std::floor(a.v[i]); });
-  }
+  static PlainLanes sqrt(PlainLanes a) { return map(std::sqrt, a); }
+  static PlainLanes abs(PlainLanes a) { return map(std::fabs, a); }
+  static PlainLanes round(PlainLanes a) { return map(std::nearbyint, a); }
+  static PlainLanes ceil(PlainLanes a) { return map(std::ceil, a); }
+  static PlainLanes floor(PlainLanes a) { return map(std::floor, a); }
   // Returns a 2^n for a in [1/2, 2] and an integer n in [-126, 0]; NaN if n is NaN (a is NaN then, too).
   static PlainLanes scale_exponent(PlainLanes a, PlainLanes n) {
     return make([&](int i) {
@@ -142,11 +124,9 @@ struct PlainLanes {
     });
   }
   static Mask greater_equal(PlainLanes a, PlainLanes b) {
-    return Mask::make([&](int i) { return a.v[i] >= b.v[i]; });
+    return map_eight<Mask>(std::greater_equal<>(), a, b);
   }
-  static Mask greater(PlainLanes a, PlainLanes b) {
-    return Mask::make([&](int i) { return a.v[i] > b.v[i]; });
-  }
+  static Mask greater(PlainLanes a, PlainLanes b) { return map_eight<Mask>(std::greater<>(), a, b); }
   static PlainLanes select(Mask m, PlainLanes a, PlainLanes b) {
     return make([&](int i) { return m.v[i] ? a.v[i] : b.v[i]; });
   }
@@ -154,11 +134,9 @@ struct PlainLanes {
     return make([&](int i) { return m.v[i] ? a.v[i] : T(0); });
   }
   Int to_int() const {  // truncates; a value that does not fit becomes the lowest integer
-    Int r;
-    for (int i = 0; i < kLanes; ++i) {
-      r.v[i] = std::fabs(v[i]) < T(2147483648.0) ? static_cast<std::int32_t>(v[i]) : INT32_MIN;
-    }
-    return r;
+    return make_eight<Int>([&](int i) {
+      return std::fabs(v[i]) < T(2147483648.0) ? static_cast<std::int32_t>(v[i]) : INT32_MIN;
+    });
   }
   T sum() const {
     const T a = v[0] + v[4], b = v[1] + v[5], c = v[2] + v[6], d = v[3] + v[7];
