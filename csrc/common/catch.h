@@ -2,6 +2,7 @@
 // What the tests that run without torch share. Catch2 v2 and v3 define their macros in different headers.
 #pragma once
 #include <cstddef>
+#include <cstdint>
 #include <memory>
 #include <vector>
 
@@ -14,6 +15,12 @@ using Catch::Approx;
 #endif
 
 namespace blitzgs {
+
+// Deterministic noise: 16 bits.
+inline std::uint32_t next_random(std::uint32_t& state) {
+  state = state * 1664525u + 1013904223u;
+  return state >> 16;
+}
 
 // Scratch memory of the kernels.
 class TestWorkspace final : public Workspace {

@@ -6,6 +6,7 @@
 #include "common/catch.h"
 #include "io/image_file.h"
 
+using blitzgs::next_random;
 using namespace blitzgs::io;
 using namespace std::string_view_literals;
 
@@ -198,11 +199,6 @@ TEST_CASE("JPEGs with wrong bytes pass or are refused, never worse") {
 // QOI
 
 namespace {
-
-std::uint32_t next_random(std::uint32_t& state) {
-  state = state * 1664525u + 1013904223u;
-  return state >> 16;
-}
 
 // An image that needs every kind of code: flat runs, gentle ramps, noise, and pixels that occur again.
 Bytes some_image(QoiSize size) {

@@ -172,9 +172,6 @@ class Checker {
   }
 
   void read_units(const std::vector<Block>& blocks, std::uint64_t units, const Band& band) {
-    bits_ = 0;
-    held_ = padding_ = zeros_ = 0;
-    end_run_ = 0;
     unsigned restarts = 0;
     if (band.first > 0) blocks[0].component->nonzero.resize(units);
     for (std::uint64_t unit = 0; unit < units; ++unit) {

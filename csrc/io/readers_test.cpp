@@ -11,6 +11,7 @@
 #include "io/colmap.h"
 #include "io/ply.h"
 
+using blitzgs::next_random;
 using namespace blitzgs::io;
 
 namespace {
@@ -82,15 +83,6 @@ bool refused(const Format& format, const std::string& bytes) {
   }
 }
 
-// Deterministic noise (splitmix64).
-std::uint64_t next_random(std::uint64_t& state) {
-  state += 0x9e3779b97f4a7c15ULL;
-  std::uint64_t z = state;
-  z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9ULL;
-  z = (z ^ (z >> 27)) * 0x94d049bb133111ebULL;
-  return z ^ (z >> 31);
-}
-
 }  // namespace
 
 TEST_CASE("every truncation of a binary COLMAP file is refused") {
@@ -104,33 +96,21 @@ TEST_CASE("every truncation of a binary COLMAP file is refused") {
 }
 
 TEST_CASE("COLMAP files with wrong bytes are read or refused, never worse") {
-  std::uint64_t state = 1;
+  std::uint32_t state = 1;
   std::vector<Format> formats = binary_formats();
   const auto text = text_formats();
   formats.insert(formats.end(), text.begin(), text.end());
   for (const Format& format : formats) {
     INFO(format.name);
-    const std::string& bytes = format.bytes;
     int refusals = 0;
     for (int round = 0; round < 2000; ++round) {
-      std::string damaged = bytes;
-      for (std::uint64_t k = 0; k <= round % 4u; ++k) {
+      std::string damaged = format.bytes;
+      for (int k = 0; k <= round % 4; ++k) {
         damaged[next_random(state) % damaged.size()] = static_cast<char>(next_random(state));
       }
       refusals += refused(format, damaged);
     }
     REQUIRE(refusals > 0);
-  }
-}
-
-TEST_CASE("a count beyond the file is refused before anything is allocated") {
-  for (const Format& format : binary_formats()) {
-    for (const char* count : {"\xff\xff\xff\xff\xff\xff\xff\xff", "\xff\xff\xff\xff\xff\xff\xff\x7f",
-                              "\x01\x00\x00\x00\x00\x00\x00\x40"}) {
-      std::string bytes = format.bytes;
-      bytes.replace(0, 8, count, 8);
-      REQUIRE(refused(format, bytes));
-    }
   }
 }
 
