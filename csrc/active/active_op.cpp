@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "active/blocks.h"
 
-#include <tuple>
-
 #include "active/pool.h"
 #include "active/view_gate.h"
 #include "common/op.h"
@@ -17,67 +15,66 @@ struct HeldRules {
   GateRules rules{};
 };
 
-void set_reach(const char* op, const std::vector<double>& reach, GateRules& rules) {
-  BLITZGS_CHECK(!reach.empty() && reach.size() <= kMaxLevels, op, "1 to ", kMaxLevels,
+void set_reach(const FloatList& reach, GateRules& rules) {
+  BLITZGS_CHECK(!reach.empty() && reach.size() <= kMaxLevels, "1 to ", kMaxLevels,
                 " levels are supported, got ", reach.size());
   rules.n_levels = static_cast<int>(reach.size());
   for (int level = 0; level < rules.n_levels; ++level) {
-    BLITZGS_CHECK(level == 0 || reach[level] <= reach[level - 1], op, "finer levels reach no farther, got ",
+    BLITZGS_CHECK(level == 0 || reach[level] <= reach[level - 1], "finer levels reach no farther, got ",
                   reach[level - 1], " and ", reach[level], " for the levels ", level - 1, " and ", level);
     rules.table.reach2[level] = reach[level] < 0 ? -1.0f : static_cast<float>(reach[level] * reach[level]);
   }
 }
 
-void set_columns(const char* op, const std::vector<std::int64_t>& columns, bool has_cull, GateRules& rules) {
+void set_columns(const IntList& columns, bool has_cull, GateRules& rules) {
   if (columns.empty()) return;
-  BLITZGS_CHECK(static_cast<int>(columns.size()) == rules.n_views, op, rules.n_views,
+  BLITZGS_CHECK(static_cast<int>(columns.size()) == rules.n_views, rules.n_views,
                 " views need as many columns of the cull matrix, got ", columns.size());
-  BLITZGS_CHECK(has_cull, op, "columns need a cull matrix");
+  BLITZGS_CHECK(has_cull, "columns need a cull matrix");
   for (int view = 0; view < rules.n_views; ++view) {
-    BLITZGS_CHECK(columns[view] < rules.cull_columns, op, "the cull matrix has ", rules.cull_columns,
+    BLITZGS_CHECK(columns[view] < rules.cull_columns, "the cull matrix has ", rules.cull_columns,
                   " columns, got column ", columns[view]);
     rules.table.columns[view] = static_cast<std::int32_t>(columns[view]);
     if (columns[view] >= 0) rules.cull_views |= 1u << view;
   }
 }
 
-HeldRules hold_rules(const char* op, std::int64_t rows, int views, const Tensor& level,
-                     const std::vector<double>& reach, std::int64_t lod_views,
-                     const std::optional<Tensor>& cull, const std::vector<std::int64_t>& columns) {
-  HeldRules held{checked<std::uint8_t>(op, "level", level, {rows}),
-                 checked<std::int32_t>(op, "cull", cull, {blocks_of(rows), -1, kSectorWords})};
+HeldRules hold_rules(std::int64_t rows, int views, const Tensor& level, const FloatList& reach,
+                     std::int64_t lod_views, const OptionalTensor& cull, const IntList& columns) {
+  HeldRules held{checked<std::uint8_t>("level", level, {rows}),
+                 checked<std::int32_t>("cull", cull, {blocks_of(rows), -1, kSectorWords})};
   if (held.cull) held.rules.cull_columns = held.cull->size(1);
   held.rules.level = held.level;
   held.rules.cull = held.cull;
   held.rules.n_rows = rows;
   held.rules.n_views = views;
   held.rules.lod_views = static_cast<std::uint32_t>(lod_views);
-  set_reach(op, reach, held.rules);
-  set_columns(op, columns, cull.has_value(), held.rules);
+  set_reach(reach, held.rules);
+  set_columns(columns, cull.has_value(), held.rules);
   return held;
 }
 
 // The columns of the table, checked. `held` keeps the tensors alive during the call.
 struct HeldRows {
-  std::vector<Tensor> held;
+  TensorList held;
   BlockRows rows{};
 };
 
 // rows: (means, scales), and if steps may be pending also the moments (exp_avg and exp_avg_sq of the means,
 // then of the scales), last_step, moment_step and table. blitzgs/ops/blocks.py builds this group.
-HeldRows hold_rows(const char* op, const std::vector<Tensor>& rows) {
-  BLITZGS_CHECK(rows.size() == 2 || rows.size() == 9, op,
+HeldRows hold_rows(const TensorList& rows) {
+  BLITZGS_CHECK(rows.size() == 2 || rows.size() == 9,
                 "rows must be (means, scales) or, with pending steps, (means, scales, exp_avg_means, "
                 "exp_avg_sq_means, exp_avg_scales, exp_avg_sq_scales, last_step, moment_step, table), got ",
                 rows.size(), " tensors");
   const std::int64_t n = rows[0].size(0);
-  BLITZGS_CHECK(n < (std::int64_t{1} << 31) - kBlockRows, op, "fewer than 2^31 - ", kBlockRows,
+  BLITZGS_CHECK(n < (std::int64_t{1} << 31) - kBlockRows, "fewer than 2^31 - ", kBlockRows,
                 " rows are supported, got ", n);
   HeldRows held;
   BlockRows& b = held.rows;
   const auto hold = [&]<class T>(const T*& column, const char* name, std::size_t at,
                                  std::initializer_list<std::int64_t> shape) {
-    column = data<T>(held.held.emplace_back(checked<T>(op, name, rows[at], shape)));
+    column = data<T>(held.held.emplace_back(checked<T>(name, rows[at], shape)));
   };
   b.n = n;
   hold(b.means, "means", 0, {n, 3});
@@ -93,38 +90,34 @@ HeldRows hold_rows(const char* op, const std::vector<Tensor>& rows) {
   return held;
 }
 
-Values<const float> checked_viewmats(const char* op, const Tensor& viewmats) {
-  const auto found = checked<float>(op, "viewmats", viewmats, {-1, 4, 4});
-  BLITZGS_CHECK(found.size(0) <= kMaxViews, op, "at most ", kMaxViews, " views at once, got ", found.size(0));
+Values<const float> checked_viewmats(const Tensor& viewmats) {
+  const auto found = checked<float>("viewmats", viewmats, {-1, 4, 4});
+  BLITZGS_CHECK(found.size(0) <= kMaxViews, "at most ", kMaxViews, " views at once, got ", found.size(0));
   return found;
 }
 
-void update_block_bounds_(const Tensor& bounds_in, const std::optional<Tensor>& ids_in,
-                          const std::vector<Tensor>& rows) {
-  constexpr const char* kOp = "update_block_bounds_";
-  const HeldRows held = hold_rows(kOp, rows);
-  const auto bounds =
-      checked_in_place<float>(kOp, "bounds", bounds_in, {blocks_of(held.rows.n), kBlockBounds});
-  const auto ids = checked<std::int32_t>(kOp, "ids", ids_in, {-1});
+void update_block_bounds_(const Tensor& bounds_in, const OptionalTensor& ids_in, const TensorList& rows) {
+  const HeldRows held = hold_rows(rows);
+  const auto bounds = checked_in_place<float>("bounds", bounds_in, {blocks_of(held.rows.n), kBlockBounds});
+  const auto ids = checked<std::int32_t>("ids", ids_in, {-1});
   // An empty tensor may have a null pointer, which would mean all rows.
   if (ids && ids->size(0) == 0) return;
   DeviceScope scope(bounds);
   backend::update_block_bounds(held.rows, ids, ids ? ids->size(0) : 0, bounds, scope.workspace, scope.stream);
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor> cull_blocks(
-    const Tensor& bounds_in, const std::vector<Tensor>& rows, const Tensor& viewmats_in, const Tensor& Ks_in,
-    std::int64_t width, std::int64_t height, double near_plane, double far_plane, double eps2d,
-    const std::optional<Tensor>& level_ranges_in, const std::optional<Tensor>& level,
-    const std::vector<double>& reach, std::int64_t lod_views, const std::optional<Tensor>& cull,
-    const std::vector<std::int64_t>& columns, std::optional<std::int64_t> capacity_in) {
-  constexpr const char* kOp = "cull_blocks";
-  const HeldRows held = hold_rows(kOp, rows);
+Tensors<4> cull_blocks(const Tensor& bounds_in, const TensorList& rows, const Tensor& viewmats_in,
+                       const Tensor& Ks_in, std::int64_t width, std::int64_t height, double near_plane,
+                       double far_plane, double eps2d, const OptionalTensor& level_ranges_in,
+                       const OptionalTensor& level, const FloatList& reach, std::int64_t lod_views,
+                       const OptionalTensor& cull, const IntList& columns,
+                       std::optional<std::int64_t> capacity_in) {
+  const HeldRows held = hold_rows(rows);
   const std::int64_t blocks = blocks_of(held.rows.n);
-  const auto bounds = checked_in_place<float>(kOp, "bounds", bounds_in, {blocks, kBlockBounds});
-  const auto viewmats = checked_viewmats(kOp, viewmats_in);
+  const auto bounds = checked_in_place<float>("bounds", bounds_in, {blocks, kBlockBounds});
+  const auto viewmats = checked_viewmats(viewmats_in);
   const auto views = static_cast<int>(viewmats.size(0));
-  const auto Ks = checked<float>(kOp, "Ks", Ks_in, {views, 3, 3});
+  const auto Ks = checked<float>("Ks", Ks_in, {views, 3, 3});
   const CullCamera camera{viewmats,
                           Ks,
                           static_cast<int>(width),
@@ -132,17 +125,17 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> cull_blocks(
                           static_cast<float>(near_plane),
                           static_cast<float>(far_plane),
                           static_cast<float>(eps2d)};
-  BLITZGS_CHECK(level_ranges_in.has_value() == level.has_value(), kOp, "a gate needs level_ranges and level");
+  BLITZGS_CHECK(level_ranges_in.has_value() == level.has_value(), "a gate needs level_ranges and level");
   BlockGate gate{};
   std::optional<HeldRules> rules;
-  const auto level_ranges = checked<std::uint8_t>(kOp, "level_ranges", level_ranges_in, {blocks, 2});
+  const auto level_ranges = checked<std::uint8_t>("level_ranges", level_ranges_in, {blocks, 2});
   if (level) {
-    rules = hold_rules(kOp, held.rows.n, views, *level, reach, lod_views, cull, columns);
+    rules = hold_rules(held.rows.n, views, *level, reach, lod_views, cull, columns);
     gate = {rules->rules, level_ranges};
   }
   DeviceScope scope(bounds);
   const CullInputs in{held.rows, bounds, camera, views, gate};
-  BLITZGS_CHECK(!capacity_in || *capacity_in > 0, kOp, "capacity_blocks must be for 1 block or more, got ",
+  BLITZGS_CHECK(!capacity_in || *capacity_in > 0, "capacity_blocks must be for 1 block or more, got ",
                 *capacity_in);
   const std::int64_t capacity = capacity_in ? std::min(*capacity_in, blocks)
                                             : backend::count_active_blocks(in, scope.workspace, scope.stream);
@@ -157,7 +150,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> cull_blocks(
 std::int32_t* words_of(const Tensor& layout) { return static_cast<std::int32_t*>(layout.mutable_data_ptr()); }
 
 Tensor sectors_of_rows(const Tensor& rows_in) {
-  const auto rows = checked<std::int32_t>("sectors_of_rows", "rows", rows_in, {-1, -1});
+  const auto rows = checked<std::int32_t>("rows", rows_in, {-1, -1});
   const std::int64_t n = rows.size(0), words = rows.size(1);
   const auto sectors = make<std::int32_t>(rows, {blocks_of(n), 32 * words, kSectorWords});
   DeviceScope scope(rows);
@@ -166,9 +159,8 @@ Tensor sectors_of_rows(const Tensor& rows_in) {
 }
 
 Tensor rows_of_sectors(const Tensor& sectors_in, std::int64_t n) {
-  constexpr const char* kOp = "rows_of_sectors";
-  const auto sectors = checked<std::int32_t>(kOp, "sectors", sectors_in, {blocks_of(n), -1, kSectorWords});
-  BLITZGS_CHECK(sectors.size(1) % 32 == 0, kOp, "sectors must be of a multiple of 32 columns, got ",
+  const auto sectors = checked<std::int32_t>("sectors", sectors_in, {blocks_of(n), -1, kSectorWords});
+  BLITZGS_CHECK(sectors.size(1) % 32 == 0, "sectors must be of a multiple of 32 columns, got ",
                 sectors.size(1));
   const std::int64_t words = sectors.size(1) / 32;
   const auto rows = make<std::int32_t>(sectors, {n, words});
@@ -177,33 +169,31 @@ Tensor rows_of_sectors(const Tensor& sectors_in, std::int64_t n) {
   return rows;
 }
 
-void gate_views_(const Tensor& ids_in, const Tensor& views_in, const std::optional<Tensor>& count,
+void gate_views_(const Tensor& ids_in, const Tensor& views_in, const OptionalTensor& count,
                  const Tensor& means_in, const Tensor& level_in, const Tensor& viewmats_in,
-                 const std::vector<double>& reach, std::int64_t lod_views,
-                 const std::optional<Tensor>& cull_in, const std::vector<std::int64_t>& columns) {
-  constexpr const char* kOp = "gate_views_";
-  const auto ids = checked<std::int32_t>(kOp, "ids", ids_in, {-1});
+                 const FloatList& reach, std::int64_t lod_views, const OptionalTensor& cull_in,
+                 const IntList& columns) {
+  const auto ids = checked<std::int32_t>("ids", ids_in, {-1});
   const std::int64_t capacity = ids.size(0);
-  const auto views = checked_in_place<std::int32_t>(kOp, "views", views_in, {capacity});
-  const auto means = checked<float>(kOp, "means", means_in, {-1, 3});
-  const auto viewmats = checked_viewmats(kOp, viewmats_in);
-  const HeldRules held = hold_rules(kOp, means.size(0), static_cast<int>(viewmats.size(0)), level_in, reach,
+  const auto views = checked_in_place<std::int32_t>("views", views_in, {capacity});
+  const auto means = checked<float>("means", means_in, {-1, 3});
+  const auto viewmats = checked_viewmats(viewmats_in);
+  const HeldRules held = hold_rules(means.size(0), static_cast<int>(viewmats.size(0)), level_in, reach,
                                     lod_views, cull_in, columns);
   if (!leaves_out_any(held.rules)) return;
   DeviceScope scope(views);
-  backend::gate_views({ids, views, max_listed(kOp, count, capacity), data_or_null<std::int32_t>(count), means,
+  backend::gate_views({ids, views, max_listed(count, capacity), data_or_null<std::int32_t>(count), means,
                        viewmats, held.rules},
                       scope.stream);
 }
 
 Tensor seen_blocks(const Tensor& bounds_in, const Tensor& viewmats_in, const Tensor& Ks_in,
                    const Tensor& sizes_in, double near_plane, double far_plane, double eps2d) {
-  constexpr const char* kOp = "seen_blocks";
-  const auto bounds = checked<float>(kOp, "bounds", bounds_in, {-1, kBlockBounds}),
-             viewmats = checked_viewmats(kOp, viewmats_in);
+  const auto bounds = checked<float>("bounds", bounds_in, {-1, kBlockBounds}),
+             viewmats = checked_viewmats(viewmats_in);
   const std::int64_t views = viewmats.size(0);
-  const auto Ks = checked<float>(kOp, "Ks", Ks_in, {views, 3, 3});
-  const auto sizes = checked<std::int32_t>(kOp, "sizes", sizes_in, {views, 2});
+  const auto Ks = checked<float>("Ks", Ks_in, {views, 3, 3});
+  const auto sizes = checked<std::int32_t>("sizes", sizes_in, {views, 2});
   const auto seen = make<std::int32_t>(bounds, {bounds.size(0)});
   DeviceScope scope(bounds);
   backend::seen_blocks(
@@ -214,34 +204,33 @@ Tensor seen_blocks(const Tensor& bounds_in, const Tensor& viewmats_in, const Ten
 }
 
 // Checks a column of the pool and of the table, and returns the bytes of a block of this column.
-std::int64_t check_pair(const char* op, const Tensor& pool, const Tensor& table) {
-  BLITZGS_CHECK(pool.dim() >= 1 && pool.dim() == table.dim(), op,
+std::int64_t check_pair(const Tensor& pool, const Tensor& table) {
+  BLITZGS_CHECK(pool.dim() >= 1 && pool.dim() == table.dim(),
                 "columns must have rows, and as many axes in pool and table; got ", shape_of(pool), " and ",
                 shape_of(table));
-  check_dtype(op, "a column of the pool", pool, table.scalar_type());
+  check_dtype("a column of the pool", pool, table.scalar_type());
   for (std::int64_t axis = 1; axis < pool.dim(); ++axis) {
-    BLITZGS_CHECK(pool.size(axis) == table.size(axis), op, "rows of pool and table must be alike, got ",
+    BLITZGS_CHECK(pool.size(axis) == table.size(axis), "rows of pool and table must be alike, got ",
                   shape_of(pool), " and ", shape_of(table));
   }
-  for (const Tensor* column : {&pool, &table}) check_contiguous(op, "columns", *column);
-  BLITZGS_CHECK(table.is_cpu(), op, "the table must be in the memory of the host");
+  for (const Tensor* column : {&pool, &table}) check_contiguous("columns", *column);
+  BLITZGS_CHECK(table.is_cpu(), "the table must be in the memory of the host");
   return kBlockRows * elements_behind(pool) * static_cast<std::int64_t>(pool.element_size());
 }
 
-void swap_blocks_(const std::vector<Tensor>& pool, const std::vector<Tensor>& table, std::int64_t n_written,
+void swap_blocks_(const TensorList& pool, const TensorList& table, std::int64_t n_written,
                   const Tensor& slots, const Tensor& leaving, const Tensor& coming) {
-  constexpr const char* kOp = "swap_blocks_";
   const auto n_columns = static_cast<std::int64_t>(pool.size());
-  BLITZGS_CHECK(n_columns <= kMaxSwapColumns && table.size() == pool.size(), kOp,
+  BLITZGS_CHECK(n_columns <= kMaxSwapColumns && table.size() == pool.size(),
                 "pool and table must have the same columns, at most ", kMaxSwapColumns, "; got ", n_columns,
                 " and ", table.size());
   SwapBlocks swap{};
   swap.n = slots.size(0);
-  swap.slots = checked_in_place<std::int32_t>(kOp, "slots", slots, {swap.n});
-  swap.leaving = checked_in_place<std::int32_t>(kOp, "leaving", leaving, {swap.n});
-  swap.coming = checked_in_place<std::int32_t>(kOp, "coming", coming, {swap.n});
+  swap.slots = checked_in_place<std::int32_t>("slots", slots, {swap.n});
+  swap.leaving = checked_in_place<std::int32_t>("leaving", leaving, {swap.n});
+  swap.coming = checked_in_place<std::int32_t>("coming", coming, {swap.n});
   for (std::int64_t c = 0; c < n_columns; ++c) {
-    const std::int64_t bytes = check_pair(kOp, pool[c], table[c]);
+    const std::int64_t bytes = check_pair(pool[c], table[c]);
     if (bytes == 0) continue;
     swap.columns[swap.n_columns++] = {static_cast<std::byte*>(pool[c].mutable_data_ptr()),
                                       static_cast<std::byte*>(table[c].mutable_data_ptr()), bytes,
@@ -253,7 +242,7 @@ void swap_blocks_(const std::vector<Tensor>& pool, const std::vector<Tensor>& ta
 }
 
 Tensor morton_keys(const Tensor& points) {
-  const auto rows = checked<float>("morton_keys", "points", points, {-1, 3});
+  const auto rows = checked<float>("points", points, {-1, 3});
   const auto keys = make<std::int64_t>(rows, {rows.size(0)});
   DeviceScope scope(rows);
   backend::morton_keys(rows, rows.size(0), keys, scope.workspace, scope.stream);
@@ -264,12 +253,12 @@ Tensor morton_keys(const Tensor& points) {
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) {
-  m.impl("update_block_bounds_", TORCH_BOX(&blitzgs::update_block_bounds_));
-  m.impl("cull_blocks", TORCH_BOX(&blitzgs::cull_blocks));
-  m.impl("sectors_of_rows", TORCH_BOX(&blitzgs::sectors_of_rows));
-  m.impl("rows_of_sectors", TORCH_BOX(&blitzgs::rows_of_sectors));
-  m.impl("gate_views_", TORCH_BOX(&blitzgs::gate_views_));
-  m.impl("seen_blocks", TORCH_BOX(&blitzgs::seen_blocks));
-  m.impl("swap_blocks_", TORCH_BOX(&blitzgs::swap_blocks_));
-  m.impl("morton_keys", TORCH_BOX(&blitzgs::morton_keys));
+  BLITZGS_OP(m, "update_block_bounds_", update_block_bounds_);
+  BLITZGS_OP(m, "cull_blocks", cull_blocks);
+  BLITZGS_OP(m, "sectors_of_rows", sectors_of_rows);
+  BLITZGS_OP(m, "rows_of_sectors", rows_of_sectors);
+  BLITZGS_OP(m, "gate_views_", gate_views_);
+  BLITZGS_OP(m, "seen_blocks", seen_blocks);
+  BLITZGS_OP(m, "swap_blocks_", swap_blocks_);
+  BLITZGS_OP(m, "morton_keys", morton_keys);
 }

@@ -1,33 +1,67 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "adam/lazy_adam_op.h"
 
+#include <cmath>
+
 #include "adam/position_noise.h"
 #include "common/op.h"
-#include "common/rows.h"
 
 namespace blitzgs {
 namespace {
 
-void lazy_adam_step(const std::vector<Tensor>& state, const std::vector<Tensor>& tables, std::int64_t step,
+// Takes the step for the rows `ids`, int32 or int64 [A], or for all rows, from a gradient [A, ...] for each
+// column. current: the parameters of the rows stand at step - 1. rates: empty, or the learning rates of the
+// step, of the first three values of SH and of all others, which enter the tables (`RatesArgs`).
+void lazy_adam_step(const TensorList& state_in, const TensorList& tables, std::int64_t step,
                     std::int64_t explicit_steps, double beta1, double beta2, double eps,
-                    const std::vector<Tensor>& grads, const std::optional<Tensor>& ids, bool current,
-                    const std::vector<double>& rates, const std::optional<Tensor>& taken) {
-  constexpr const char* kOp = "lazy_adam_step_";
-  AdamTensors adam(kOp, state, tables, {step, explicit_steps, beta1, beta2, eps});
-  float* count = taken ? checked_in_place<float>(kOp, "taken", *taken, {}).data() : nullptr;
-  BLITZGS_CHECK(!taken || taken->is_cpu(), kOp, "taken must be on the CPU");
-  adam.step_rows(grads, ids, current, rates);
-  if (count) ++*count;
+                    const TensorList& grads, const OptionalTensor& ids, bool current, const FloatList& rates,
+                    const OptionalTensor& taken) {
+  AdamTensors state(state_in, tables, {step, explicit_steps, beta1, beta2, eps});
+  float* taken_steps = taken ? checked_in_place<float>("taken", *taken, {}).data() : nullptr;
+  BLITZGS_CHECK(!taken || taken->is_cpu(), "taken must be on the CPU");
+  BLITZGS_CHECK(std::ssize(grads) == state.count(), "grads must hold ",
+                state.alone ? "one" : "means, quats, scales, opacities, sh", "; got ", grads.size(),
+                " tensors");
+  BLITZGS_CHECK(rates.empty() || (rates.size() == 2 && state.alone && !state.final_rules),
+                "rates must be empty or two numbers, for one parameter and tables without final_rules");
+  state.check_takes_step();
+  const OptionalTensor list = state.checked_rows(ids);
+  const std::int64_t n = list ? list->numel() : state.rows();
+  TensorList held;
+  for (int c = 0; c < state.count(); ++c) {
+    const Tensor& grad = held.emplace_back(as_contiguous(grads[c]));
+    check_dtype("grads", grad, state.like().scalar_type());
+    BLITZGS_CHECK(grad.dim() >= 1 && grad.size(0) == n && grad.numel() == n * state.width(c),
+                  "the gradient of ", state.name(c), " must have ", n, " rows of ", state.width(c),
+                  " values, got ", shape_of(grad));
+  }
+  DeviceScope scope(state.like());
+  dispatch_floating(state.like(), [&]<class T>() {
+    AdamArgs<T> args = state.arguments<T>(list);
+    for (int c = 0; c < state.count(); ++c) args.columns[state.first() + c].grad = data<T>(held[c]);
+    args.current = current;
+    if (!rates.empty()) {
+      const double root = std::sqrt(beta2);
+      args.rates = {mutable_data<double>(state.table),
+                    mutable_data<float>(state.lr_table),
+                    args.step,
+                    args.explicit_steps,
+                    beta1 / root,
+                    root,
+                    {static_cast<float>(rates[0]), static_cast<float>(rates[1])}};
+    }
+    if (n > 0 || !rates.empty()) backend::lazy_adam(args, scope.workspace, scope.stream);
+  });
+  if (taken_steps) ++*taken_steps;
 }
 
-void lazy_adam_catch_up(const std::vector<Tensor>& state_in, const std::vector<Tensor>& tables,
-                        std::int64_t step, std::int64_t explicit_steps, double beta1, double beta2,
-                        double eps, const std::optional<Tensor>& ids, const std::optional<Tensor>& count) {
-  constexpr const char* kOp = "lazy_adam_catch_up_";
-  AdamTensors state(kOp, state_in, tables, {step, explicit_steps, beta1, beta2, eps});
-  const std::optional<Tensor> list = state.checked_rows(ids);
-  if (count) check_device(kOp, "count", *count, state.like(), state.name(0));
-  const std::int64_t n = max_listed(kOp, count, list ? list->numel() : state.rows());
+void lazy_adam_catch_up(const TensorList& state_in, const TensorList& tables, std::int64_t step,
+                        std::int64_t explicit_steps, double beta1, double beta2, double eps,
+                        const OptionalTensor& ids, const OptionalTensor& count) {
+  AdamTensors state(state_in, tables, {step, explicit_steps, beta1, beta2, eps});
+  const OptionalTensor list = state.checked_rows(ids);
+  if (count) check_device("count", *count, state.like(), state.name(0));
+  const std::int64_t n = max_listed(count, list ? list->numel() : state.rows());
   DeviceScope scope(state.like());
   dispatch_floating(state.like(), [&]<class T>() {
     auto args = state.arguments<T>(list);
@@ -39,20 +73,17 @@ void lazy_adam_catch_up(const std::vector<Tensor>& state_in, const std::vector<T
 
 Tensor lazy_adam_final_rules(const Tensor& table, const Tensor& like, std::int64_t explicit_steps,
                              double eps) {
-  constexpr const char* kOp = "lazy_adam_final_rules";
-  const auto values = checked<double>(kOp, "table", table, {-1, kAdamTable});
-  check_floating(kOp, "like", like);
-  BLITZGS_CHECK(explicit_steps >= 1, kOp, "explicit_steps must be 1 or more, got ", explicit_steps);
+  const auto values = checked<double>("table", table, {-1, kAdamTable});
+  check_floating("like", like);
+  BLITZGS_CHECK(explicit_steps >= 1, "explicit_steps must be 1 or more, got ", explicit_steps);
   const std::int64_t n = final_rules_of(table.size(0), explicit_steps);
-  DeviceScope scope(values);
   return dispatch_floating(like, [&]<class T>() -> Tensor {
     AdamArgs<T> args{};
     args.table = values;
     args.explicit_steps = static_cast<std::int32_t>(explicit_steps);
     args.eps = eps;
     const auto rules = make<std::uint8_t>(values, {n, sizeof(PendingSteps<T>)});
-    backend::for_each_row(FinalRules<T>{args, reinterpret_cast<PendingSteps<T>*>(rules.data()), n},
-                          scope.stream);
+    run_rows(values, FinalRules<T>{args, reinterpret_cast<PendingSteps<T>*>(rules.data()), n});
     return rules;
   });
 }
@@ -60,20 +91,17 @@ Tensor lazy_adam_final_rules(const Tensor& table, const Tensor& like, std::int64
 void position_noise_(const Tensor& means, const Tensor& quats, const Tensor& scales, const Tensor& opacities,
                      const Tensor& ids_in, const Tensor& visible_ids_in, std::int64_t seed, std::int64_t step,
                      double threshold, double strength) {
-  constexpr const char* kOp = "position_noise_";
-  check_floating(kOp, "means", means);
+  check_floating("means", means);
   const std::int64_t n = means.size(0);
-  const auto ids = checked<std::int64_t>(kOp, "ids", ids_in, {n});
-  const auto visible_ids = checked<std::int32_t>(kOp, "visible_ids", visible_ids_in, {-1});
-  DeviceScope scope(means);
+  const auto ids = checked<std::int64_t>("ids", ids_in, {n});
+  const auto visible_ids = checked<std::int32_t>("visible_ids", visible_ids_in, {-1});
   dispatch_floating(means, [&]<class T>() {
-    const auto moved = checked_in_place<T>(kOp, "means", means, {n, 3});
-    const auto q = checked<T>(kOp, "quats", quats, {n, 4}), s = checked<T>(kOp, "scales", scales, {n, 3}),
-               o = checked<T>(kOp, "opacities", opacities, {n});
+    const auto moved = checked_in_place<T>("means", means, {n, 3});
+    const auto q = checked<T>("quats", quats, {n, 4}), s = checked<T>("scales", scales, {n, 3}),
+               o = checked<T>("opacities", opacities, {n});
     if (strength == 0) return;
-    backend::for_each_row(PositionNoise<T>{moved, q, s, o, ids, visible_ids, visible_ids.size(0), seed, step,
-                                           threshold, strength},
-                          scope.stream);
+    run_rows(means, PositionNoise<T>{moved, q, s, o, ids, visible_ids, visible_ids.size(0), seed, step,
+                                     threshold, strength});
   });
 }
 
@@ -81,8 +109,8 @@ void position_noise_(const Tensor& means, const Tensor& quats, const Tensor& sca
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) {
-  m.impl("lazy_adam_step_", TORCH_BOX(&blitzgs::lazy_adam_step));
-  m.impl("lazy_adam_final_rules", TORCH_BOX(&blitzgs::lazy_adam_final_rules));
-  m.impl("lazy_adam_catch_up_", TORCH_BOX(&blitzgs::lazy_adam_catch_up));
-  m.impl("position_noise_", TORCH_BOX(&blitzgs::position_noise_));
+  BLITZGS_OP(m, "lazy_adam_step_", lazy_adam_step);
+  BLITZGS_OP(m, "lazy_adam_final_rules", lazy_adam_final_rules);
+  BLITZGS_OP(m, "lazy_adam_catch_up_", lazy_adam_catch_up);
+  BLITZGS_OP(m, "position_noise_", position_noise_);
 }

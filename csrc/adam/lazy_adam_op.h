@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // The checked tensors of the optimiser's state and schedule, for all ops that move parameters.
 #pragma once
-#include <cmath>
 #include <utility>
 
 #include "adam/lazy_adam.h"
@@ -26,22 +25,20 @@ struct AdamConstants {
 // single parameter of any width, which takes the place of sh; tables: (table of lazy_adam.h, lr_table[,
 // final_rules]). blitzgs/ops/lazy_adam.py builds these groups.
 struct AdamTensors {
-  const char* op;
   bool alone;  // a single parameter
-  std::vector<Tensor> params, exp_avgs, exp_avg_sqs;
+  TensorList params, exp_avgs, exp_avg_sqs;
   Tensor last_step, moment_step, table, lr_table;
-  std::optional<Tensor> final_rules;
+  OptionalTensor final_rules;
   AdamConstants constants;
 
-  AdamTensors(const char* op_name, const std::vector<Tensor>& state, const std::vector<Tensor>& tables,
-              const AdamConstants& constants_in)
-      : op(op_name), alone(state.size() == kAloneState), constants(constants_in) {
-    BLITZGS_CHECK((alone || state.size() == kAdamState) && (tables.size() == 2 || tables.size() == 3), op,
+  AdamTensors(const TensorList& state, const TensorList& tables, const AdamConstants& constants_in)
+      : alone(state.size() == kAloneState), constants(constants_in) {
+    BLITZGS_CHECK((alone || state.size() == kAdamState) && (tables.size() == 2 || tables.size() == 3),
                   "expected state (params, exp_avgs and exp_avg_sqs of means, quats, scales, opacities ",
                   "and sh, or of one parameter, last_step, moment_step) and tables (table, lr_table[, ",
                   "final_rules]); got ", state.size(), " and ", tables.size(), " entries");
     auto next = state.begin();
-    for (std::vector<Tensor>* columns : {&params, &exp_avgs, &exp_avg_sqs}) {
+    for (TensorList* columns : {&params, &exp_avgs, &exp_avg_sqs}) {
       columns->assign(next, next + count());
       next += count();
     }
@@ -62,17 +59,18 @@ struct AdamTensors {
   std::int64_t rows() const { return like().size(0); }
 
   // Checks a list of rows, int32 [n] or int64 [n] or [1, n] (as sparse tensors have them); none: all rows.
-  std::optional<Tensor> checked_rows(const std::optional<Tensor>& ids) const {
+  OptionalTensor checked_rows(const OptionalTensor& ids) const {
     if (!ids) return std::nullopt;
-    check_device(op, "ids", *ids, like(), name(0));
+    check_device("ids", *ids, like(), name(0));
     const bool is_long = ids->scalar_type() == ScalarType::Long;
-    if (is_long && ids->dim() == 2) return checked(op, "ids", *ids, ScalarType::Long, {1, -1});
-    return checked(op, "ids", *ids, is_long ? ScalarType::Long : ScalarType::Int, {-1});
+    if (is_long && ids->dim() == 2) return checked("ids", *ids, ScalarType::Long, {1, -1});
+    return checked("ids", *ids, is_long ? ScalarType::Long : ScalarType::Int, {-1});
   }
 
-  // The kernel's arguments for the rows of a list (`checked_rows`). Gradients are null; the caller sets them.
+  // The kernel's arguments for the rows of a list (`checked_rows`). Gradients are null; the caller sets
+  // them.
   template <class T>
-  AdamArgs<T> arguments(const std::optional<Tensor>& ids) {
+  AdamArgs<T> arguments(const OptionalTensor& ids) {
     AdamArgs<T> args{};
     for (int c = 0; c < count(); ++c) {
       args.columns[first() + c] = {mutable_data<T>(params[c]), mutable_data<T>(exp_avgs[c]),
@@ -90,7 +88,7 @@ struct AdamTensors {
     args.lr_table = data<float>(lr_table);
     if (final_rules) {
       const auto bytes = checked_in_place<std::uint8_t>(
-          op, "final_rules", *final_rules,
+          "final_rules", *final_rules,
           {final_rules_of(table.size(0), constants.explicit_steps), sizeof(PendingSteps<T>)});
       args.final_rules = reinterpret_cast<const PendingSteps<T>*>(bytes.data());
     }
@@ -102,81 +100,43 @@ struct AdamTensors {
     return args;
   }
 
-  // Takes the step for the rows `ids`, int32 or int64 [A], or for all rows, from a gradient [A, ...] for each
-  // column. current: the parameters of the rows stand at step - 1. rates: empty, or the learning rates of the
-  // step, of the first three values of SH and of all others, which enter the tables (`RatesArgs`).
-  void step_rows(const std::vector<Tensor>& grads, const std::optional<Tensor>& ids, bool current,
-                 const std::vector<double>& rates) {
-    BLITZGS_CHECK(std::ssize(grads) == count(), op, "grads must hold ",
-                  alone ? "one" : "means, quats, scales, opacities, sh", "; got ", grads.size(), " tensors");
-    BLITZGS_CHECK(rates.empty() || (rates.size() == 2 && alone && !final_rules), op,
-                  "rates must be empty or two numbers, for one parameter and tables without final_rules");
-    check_takes_step();
-    const std::optional<Tensor> list = checked_rows(ids);
-    const std::int64_t n = list ? list->numel() : rows();
-    std::vector<Tensor> held;
-    for (int c = 0; c < count(); ++c) {
-      const Tensor& grad = held.emplace_back(as_contiguous(grads[c]));
-      check_dtype(op, "grads", grad, like().scalar_type());
-      BLITZGS_CHECK(grad.dim() >= 1 && grad.size(0) == n && grad.numel() == n * width(c), op,
-                    "the gradient of ", name(c), " must have ", n, " rows of ", width(c), " values, got ",
-                    shape_of(grad));
-    }
-    DeviceScope scope(like());
-    dispatch_floating(like(), [&]<class T>() {
-      AdamArgs<T> args = arguments<T>(list);
-      for (int c = 0; c < count(); ++c) args.columns[first() + c].grad = data<T>(held[c]);
-      args.current = current;
-      if (!rates.empty()) {
-        args.rates = {mutable_data<double>(table),
-                      mutable_data<float>(lr_table),
-                      args.step,
-                      args.explicit_steps,
-                      constants.beta1 / std::sqrt(constants.beta2),
-                      std::sqrt(constants.beta2),
-                      {static_cast<float>(rates[0]), static_cast<float>(rates[1])}};
-      }
-      if (n > 0 || !rates.empty()) backend::lazy_adam(args, scope.workspace, scope.stream);
-    });
-  }
-
   void check_takes_step() const {
-    BLITZGS_CHECK(constants.step >= 1, op, "steps count from 1, got ", constants.step);
+    BLITZGS_CHECK(constants.step >= 1, "steps count from 1, got ", constants.step);
   }
 
   std::int64_t width(int column) const { return rows() ? params[column].numel() / rows() : 0; }
 
  private:
   void check() const {
-    check_floating(op, "means", like());
+    check_floating("means", like());
     for (int c = 0; c < count(); ++c) {
       for (const Tensor* tensor : {&params[c], &exp_avgs[c], &exp_avg_sqs[c]}) check_column(*tensor, c);
     }
     for (const auto& [c, values] : {std::pair{0, 3}, std::pair{1, 4}, std::pair{2, 3}, std::pair{3, 1}}) {
-      BLITZGS_CHECK(alone || params[c].numel() == values * rows(), op, kAdamNames[c], " must have ", values,
+      BLITZGS_CHECK(alone || params[c].numel() == values * rows(), kAdamNames[c], " must have ", values,
                     " values in each of ", rows(), " rows, got ", shape_of(params[c]));
     }
     for (const auto& [what, tensor] :
          {std::pair{"last_step", &last_step}, std::pair{"moment_step", &moment_step},
           std::pair{"table", &table}, std::pair{"lr_table", &lr_table}}) {
-      check_device(op, what, *tensor, like(), name(0));
+      check_device(what, *tensor, like(), name(0));
     }
-    check_in_place(op, "last_step", last_step, ScalarType::Int, {rows()});
-    check_in_place(op, "moment_step", moment_step, ScalarType::Int, {rows()});
-    check_in_place(op, "table", table, ScalarType::Double, {-1, kAdamTable});
-    check_in_place(op, "lr_table", lr_table, ScalarType::Float, {table.size(0), kAdamGroups});
+    check_in_place("last_step", last_step, ScalarType::Int, {rows()});
+    check_in_place("moment_step", moment_step, ScalarType::Int, {rows()});
+    check_in_place("table", table, ScalarType::Double, {-1, kAdamTable});
+    check_in_place("lr_table", lr_table, ScalarType::Float, {table.size(0), kAdamGroups});
     const std::int64_t step = constants.step;
-    BLITZGS_CHECK(step >= 0 && step < table.size(0), op, "step ", step,
+    BLITZGS_CHECK(step >= 0 && step < table.size(0), "step ", step,
                   " is outside the learning-rate table, which ends at step ", table.size(0) - 1);
   }
 
   void check_column(const Tensor& tensor, int column) const {
-    check_device(op, "a parameter or moment", tensor, like(), name(0));
-    check_dtype(op, name(column), tensor, like().scalar_type());
-    check_contiguous(op, name(column), tensor);
-    BLITZGS_CHECK(tensor.dim() >= 1 && tensor.size(0) == rows(), op, name(column), " must have ", rows(),
+    check_device("a parameter or moment", tensor, like(), name(0));
+    check_dtype(name(column), tensor, like().scalar_type());
+    check_contiguous(name(column), tensor);
+    BLITZGS_CHECK(tensor.dim() >= 1 && tensor.size(0) == rows(), name(column), " must have ", rows(),
                   " rows, got ", shape_of(tensor));
-    BLITZGS_CHECK(tensor.numel() == params[column].numel(), op, "the moments of ", name(column),
+    BLITZGS_CHECK(tensor.numel() == params[column].numel(), "the moments of ", name(column),
                   " must have its shape ", shape_of(params[column]));
   }
 };

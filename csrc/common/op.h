@@ -8,37 +8,50 @@
 #include <torch/csrc/stable/tensor.h>
 #include <torch/headeronly/core/ScalarType.h>
 #include <algorithm>
+#include <array>
 #include <cstdint>
 #include <initializer_list>
-#include <limits>
 #include <optional>
 #include <sstream>
 #include <stdexcept>
 #include <string>
+#include <tuple>
 #include <type_traits>
 #include <vector>
 
 #include "common/kernel.h"
+#include "common/rows.h"
 #include "math/tiles.h"
 
 #ifdef BLITZGS_BACKEND_CUDA
 #define BLITZGS_DISPATCH_KEY CUDA
+#define BLITZGS_ON_CUDA true
 #else
 #define BLITZGS_DISPATCH_KEY CPU
+#define BLITZGS_ON_CUDA false
 #endif
 
 // STABLE_TORCH_LIBRARY_IMPL pastes its key, so the key macro has to be expanded first. One BLITZGS_REGISTER
 // block per file; the file's op name keeps the symbols apart.
 #define BLITZGS_REGISTER_EXPANDED(key, m) STABLE_TORCH_LIBRARY_IMPL(blitzgs, key, m)
 #define BLITZGS_REGISTER(m) BLITZGS_REGISTER_EXPANDED(BLITZGS_DISPATCH_KEY, m)
+#define BLITZGS_OP(m, name, function) m.impl(name, ::blitzgs::named_op<name, TORCH_BOX(&::blitzgs::function)>)
 
 namespace blitzgs::BLITZGS_BACKEND {}
 
 namespace blitzgs {
 
 namespace backend = BLITZGS_BACKEND;
+inline constexpr bool kOnCuda = BLITZGS_ON_CUDA;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
+using OptionalTensor = std::optional<Tensor>;
+using TensorList = std::vector<Tensor>;
+using IntList = std::vector<std::int64_t>;
+using FloatList = std::vector<double>;
+// The N results of an op.
+template <std::size_t N>
+using Tensors = decltype(std::tuple_cat(std::array<Tensor, N>()));
 
 inline std::string shape_of(const Tensor& tensor) {
   std::ostringstream text;
@@ -55,26 +68,45 @@ inline std::int64_t elements_behind(const Tensor& column, std::int64_t axis = 1)
   return elements;
 }
 
+// An error in the arguments of an op, without the op's name, which BLITZGS_OP adds.
+struct CheckFailed : std::runtime_error {
+  using std::runtime_error::runtime_error;
+};
+
 template <typename... Parts>
 [[noreturn]] void fail(const Parts&... parts) {
   std::ostringstream text;
-  text << "blitzgs::";
   (text << ... << parts);
-  throw std::runtime_error(text.str());
+  throw CheckFailed(text.str());
 }
 
-// Throws "blitzgs::<op>: <message>" unless a condition holds. Unlike STD_TORCH_CHECK, without the path of the
-// source file, which says nothing to a user.
-#define BLITZGS_CHECK(condition, op, ...)     \
-  do {                                        \
-    if (!(condition)) [[unlikely]]            \
-      ::blitzgs::fail(op, ": ", __VA_ARGS__); \
+// Throws the message unless a condition holds. Unlike STD_TORCH_CHECK, without the path of the source file,
+// which says nothing to a user.
+#define BLITZGS_CHECK(condition, ...) \
+  do {                                \
+    if (!(condition)) [[unlikely]]    \
+      ::blitzgs::fail(__VA_ARGS__);   \
   } while (false)
+
+template <std::size_t Length>
+struct OpName {
+  char text[Length];
+  constexpr OpName(const char (&name)[Length]) { std::copy_n(name, Length, text); }
+};
+
+// The boxed function of an op, whose errors begin with "blitzgs::<op>: ".
+template <OpName name, auto boxed>
+void named_op(StableIValue* stack, std::uint64_t n_arguments, std::uint64_t n_results) {
+  try {
+    boxed(stack, n_arguments, n_results);
+  } catch (const CheckFailed& error) {
+    throw std::runtime_error("blitzgs::" + std::string(name.text) + ": " + error.what());
+  }
+}
 
 // shape: one entry per dimension, -1 for any size. The message is built only if the check fails, because a
 // step checks some two hundred tensors while the GPU waits for its next kernel.
-inline void check_shape(const char* op, const char* name, const Tensor& tensor,
-                        std::initializer_list<std::int64_t> shape) {
+inline void check_shape(const char* name, const Tensor& tensor, std::initializer_list<std::int64_t> shape) {
   bool ok = tensor.dim() == static_cast<std::int64_t>(shape.size());
   std::int64_t axis = 0;
   for (const std::int64_t size : shape) {
@@ -86,45 +118,47 @@ inline void check_shape(const char* op, const char* name, const Tensor& tensor,
   for (const std::int64_t size : shape) {
     wanted << (wanted.tellp() > 0 ? ", " : "") << (size < 0 ? "*" : std::to_string(size));
   }
-  BLITZGS_CHECK(false, op, name, " must have shape [", wanted.str(), "], got ", shape_of(tensor));
+  BLITZGS_CHECK(false, name, " must have shape [", wanted.str(), "], got ", shape_of(tensor));
 }
 
-inline void check_dtype(const char* op, const char* name, const Tensor& tensor, ScalarType dtype) {
-  BLITZGS_CHECK(tensor.scalar_type() == dtype, op, name, " must be ", torch::headeronly::toString(dtype),
+// Checks the number of entries of a group of arguments. names: those of the entries, for the message.
+template <class List>
+void check_group(const char* names, const List& list, std::size_t least, std::size_t most) {
+  BLITZGS_CHECK(list.size() >= least && list.size() <= most, "expected ", names, ", got ", list.size(),
+                " entries");
+}
+
+inline void check_dtype(const char* name, const Tensor& tensor, ScalarType dtype) {
+  BLITZGS_CHECK(tensor.scalar_type() == dtype, name, " must be ", torch::headeronly::toString(dtype),
                 ", got ", torch::headeronly::toString(tensor.scalar_type()));
 }
 
 // Checks that a tensor is on the device of `like`, which the message calls `of`. A kernel that reads memory
 // of the host ends all further work of the process on the GPU.
-inline void check_device(const char* op, const char* name, const Tensor& tensor, const Tensor& like,
-                         const char* of) {
-  BLITZGS_CHECK(tensor.is_cpu() == like.is_cpu() && tensor.get_device_index() == like.get_device_index(), op,
-                "", name, " must be on the device of ", of);
+inline void check_device(const char* name, const Tensor& tensor, const Tensor& like, const char* of) {
+  BLITZGS_CHECK(tensor.is_cpu() == like.is_cpu() && tensor.get_device_index() == like.get_device_index(),
+                name, " must be on the device of ", of);
 }
 
-inline void check_contiguous(const char* op, const char* name, const Tensor& tensor) {
-  BLITZGS_CHECK(tensor.is_contiguous(), op, name, " must be contiguous");
+inline void check_contiguous(const char* name, const Tensor& tensor) {
+  BLITZGS_CHECK(tensor.is_contiguous(), name, " must be contiguous");
 }
 
 // Checks a tensor that kernels read or write in its own memory, so that it must be contiguous.
-inline void check_in_place(const char* op, const char* name, const Tensor& tensor, ScalarType dtype,
+inline void check_in_place(const char* name, const Tensor& tensor, ScalarType dtype,
                            std::initializer_list<std::int64_t> shape) {
-  check_dtype(op, name, tensor, dtype);
-  check_shape(op, name, tensor, shape);
-  check_contiguous(op, name, tensor);
+  check_dtype(name, tensor, dtype);
+  check_shape(name, tensor, shape);
+  check_contiguous(name, tensor);
 }
 
 // float32 everywhere; float64 on the CPU, where it serves gradcheck and accuracy figures.
-inline void check_floating(const char* op, const char* name, const Tensor& tensor) {
+inline void check_floating(const char* name, const Tensor& tensor) {
   const ScalarType dtype = tensor.scalar_type();
-#ifdef BLITZGS_BACKEND_CUDA
-  BLITZGS_CHECK(dtype == ScalarType::Float, op, name,
-                " must be float32 on CUDA (float64 runs on the CPU), got ",
+  BLITZGS_CHECK(dtype == ScalarType::Float || (!kOnCuda && dtype == ScalarType::Double), name,
+                kOnCuda ? " must be float32 on CUDA (float64 runs on the CPU), got "
+                        : " must be float32 or float64, got ",
                 torch::headeronly::toString(dtype));
-#else
-  BLITZGS_CHECK(dtype == ScalarType::Float || dtype == ScalarType::Double, op, name,
-                " must be float32 or float64, got ", torch::headeronly::toString(dtype));
-#endif
 }
 
 // Tests is_contiguous() first, because most tensors are contiguous, and torch::stable::contiguous() looks the
@@ -134,16 +168,16 @@ inline Tensor as_contiguous(const Tensor& tensor) {
 }
 
 // Checks a tensor that kernels only read, and returns it in contiguous memory.
-inline Tensor checked(const char* op, const char* name, const Tensor& tensor, ScalarType dtype,
+inline Tensor checked(const char* name, const Tensor& tensor, ScalarType dtype,
                       std::initializer_list<std::int64_t> shape) {
-  check_dtype(op, name, tensor, dtype);
-  check_shape(op, name, tensor, shape);
+  check_dtype(name, tensor, dtype);
+  check_shape(name, tensor, shape);
   return as_contiguous(tensor);
 }
 
-inline std::optional<Tensor> checked(const char* op, const char* name, const std::optional<Tensor>& tensor,
-                                     ScalarType dtype, std::initializer_list<std::int64_t> shape) {
-  return tensor ? std::optional(checked(op, name, *tensor, dtype, shape)) : std::nullopt;
+inline OptionalTensor checked(const char* name, const OptionalTensor& tensor, ScalarType dtype,
+                              std::initializer_list<std::int64_t> shape) {
+  return tensor ? std::optional(checked(name, *tensor, dtype, shape)) : std::nullopt;
 }
 
 template <class T>
@@ -156,7 +190,7 @@ T* mutable_data(const Tensor& tensor) {
 }
 // Null for an absent optional tensor.
 template <class T>
-const T* data_or_null(const std::optional<Tensor>& tensor) {
+const T* data_or_null(const OptionalTensor& tensor) {
   return tensor ? static_cast<const T*>(tensor->const_data_ptr()) : nullptr;
 }
 
@@ -183,32 +217,31 @@ using dtype_of = torch::headeronly::CppTypeToScalarType<T>;
 
 // checked() of values of type T.
 template <class T>
-Values<const T> checked(const char* op, const char* name, const Tensor& tensor,
-                        std::initializer_list<std::int64_t> shape) {
-  return Values<const T>(checked(op, name, tensor, dtype_of<T>::value, shape));
+Values<const T> checked(const char* name, const Tensor& tensor, std::initializer_list<std::int64_t> shape) {
+  return Values<const T>(checked(name, tensor, dtype_of<T>::value, shape));
 }
 
 template <class T>
-OptionalValues<const T> checked(const char* op, const char* name, const std::optional<Tensor>& tensor,
+OptionalValues<const T> checked(const char* name, const OptionalTensor& tensor,
                                 std::initializer_list<std::int64_t> shape) {
   OptionalValues<const T> values;
-  if (tensor) values.emplace(checked<T>(op, name, *tensor, shape));
+  if (tensor) values.emplace(checked<T>(name, *tensor, shape));
   return values;
 }
 
 // Checks a tensor that kernels read or write in its own memory, so that it must be contiguous.
 template <class T>
-Values<T> checked_in_place(const char* op, const char* name, const Tensor& tensor,
+Values<T> checked_in_place(const char* name, const Tensor& tensor,
                            std::initializer_list<std::int64_t> shape) {
-  check_in_place(op, name, tensor, dtype_of<T>::value, shape);
+  check_in_place(name, tensor, dtype_of<T>::value, shape);
   return Values<T>(tensor);
 }
 
 // Calls the C functions of torch directly, because a step allocates some sixty tensors.
-inline Tensor make_empty(const Tensor& like, const std::vector<std::int64_t>& shape,
+inline Tensor make_empty(const Tensor& like, const IntList& shape,
                          std::optional<ScalarType> dtype = std::nullopt) {
   const auto rank = static_cast<std::int64_t>(shape.size());
-  std::vector<std::int64_t> strides(shape.size(), 1);
+  IntList strides(shape.size(), 1);
   for (std::int64_t i = rank - 1; i > 0; --i)
     strides[i - 1] = strides[i] * std::max<std::int64_t>(shape[i], 1);
   std::int32_t device_type = 0;
@@ -221,14 +254,14 @@ inline Tensor make_empty(const Tensor& like, const std::vector<std::int64_t>& sh
 }
 
 template <class T>
-Values<T> make(const Tensor& like, const std::vector<std::int64_t>& shape) {
+Values<T> make(const Tensor& like, const IntList& shape) {
   return Values<T>(make_empty(like, shape, dtype_of<T>::value));
 }
 
 // A tensor in the memory of another one, `offset` elements after its begin. Autograd does not see that it is
 // a view.
-inline Tensor view_of(const Tensor& tensor, const std::vector<std::int64_t>& shape,
-                      const std::vector<std::int64_t>& strides, std::int64_t offset) {
+inline Tensor view_of(const Tensor& tensor, const IntList& shape, const IntList& strides,
+                      std::int64_t offset) {
   AtenTensorHandle handle = nullptr;
   // Despite the name of its parameter, torch adds the offset to that of the tensor.
   TORCH_ERROR_CODE_CHECK(aoti_torch__reinterpret_tensor(tensor.get(), static_cast<std::int64_t>(shape.size()),
@@ -239,18 +272,15 @@ inline Tensor view_of(const Tensor& tensor, const std::vector<std::int64_t>& sha
 // An upper bound on the number of valid entries of a list that can have `capacity` of them. The first count
 // [1] entries are valid; without a count all are. On CUDA the bound is the capacity, because the host does
 // not wait for the count; the kernels read it.
-inline std::int64_t max_listed(const char* op, const std::optional<Tensor>& count, std::int64_t capacity) {
+inline std::int64_t max_listed(const OptionalTensor& count, std::int64_t capacity) {
   if (!count) return capacity;
-  check_dtype(op, "the count of a list", *count, ScalarType::Int);
-  check_shape(op, "the count of a list", *count, {1});
-#ifdef BLITZGS_BACKEND_CUDA
-  return capacity;
-#else
+  check_dtype("the count of a list", *count, ScalarType::Int);
+  check_shape("the count of a list", *count, {1});
+  if (kOnCuda) return capacity;
   const std::int64_t listed = *data<std::int32_t>(*count);
-  BLITZGS_CHECK(listed >= 0 && listed <= capacity, op, "a list of ", capacity, " cannot have ", listed,
+  BLITZGS_CHECK(listed >= 0 && listed <= capacity, "a list of ", capacity, " cannot have ", listed,
                 " entries");
   return listed;
-#endif
 }
 
 class TorchWorkspace final : public Workspace {
@@ -263,7 +293,7 @@ class TorchWorkspace final : public Workspace {
 
  private:
   Tensor like_;
-  std::vector<Tensor> held_;
+  TensorList held_;
 };
 
 // Makes the tensor's device current and finds its stream (CUDA), and provides scratch memory. Kernels take
@@ -290,6 +320,13 @@ struct DeviceScope {
 #endif
 };
 
+// for_each_row() on the device and stream of `like`.
+template <class Rows>
+void run_rows(const Tensor& like, const Rows& work) {
+  DeviceScope scope(like);
+  backend::for_each_row(work, scope.stream);
+}
+
 // Returns f<T>() with T = float or double by the tensor's dtype (CUDA: float only).
 template <class F>
 auto dispatch_floating([[maybe_unused]] const Tensor& tensor, const F& f) {
@@ -305,48 +342,45 @@ struct SplatCount {
   const std::int64_t* known_splats;  // null: all n_splats are valid; else kernels read the number here
 };
 
-inline SplatCount checked_splat_count(const char* op, const std::optional<Tensor>& n_splats,
-                                      const Tensor& splats) {
+inline SplatCount checked_splat_count(const OptionalTensor& n_splats, const Tensor& splats) {
   const std::int64_t capacity = splats.size(0);
-  BLITZGS_CHECK(capacity <= std::numeric_limits<std::int32_t>::max(), op, "splat indices are 32-bit, got ",
-                capacity, " splats; render fewer views at once");
+  BLITZGS_CHECK(capacity <= INT32_MAX, "splat indices are 32-bit, got ", capacity,
+                " splats; render fewer views at once");
   if (!n_splats) return {capacity, nullptr};
-  check_dtype(op, "n_splats", *n_splats, ScalarType::Long);
-  check_shape(op, "n_splats", *n_splats, {1});
-  check_device(op, "n_splats", *n_splats, splats, "the splats");
-#ifdef BLITZGS_BACKEND_CUDA
-  return {capacity, data<std::int64_t>(*n_splats)};
-#else
+  check_dtype("n_splats", *n_splats, ScalarType::Long);
+  check_shape("n_splats", *n_splats, {1});
+  check_device("n_splats", *n_splats, splats, "the splats");
+  if (kOnCuda) return {capacity, data<std::int64_t>(*n_splats)};
   return {valid_splat_count(capacity, data<std::int64_t>(*n_splats)), nullptr};
-#endif
 }
 
-inline void check_tile_range(const char* op, std::int64_t begin, std::int64_t end, std::int64_t tiles) {
-  BLITZGS_CHECK(0 <= begin && begin <= end && end <= tiles, op,
-                "tile_begin and tile_end must be a range of the ", tiles, " tiles, got [", begin, ", ", end,
-                ")");
+inline void check_tile_range(std::int64_t begin, std::int64_t end, std::int64_t tiles) {
+  BLITZGS_CHECK(0 <= begin && begin <= end && end <= tiles, "tile_begin and tile_end must be a range of the ",
+                tiles, " tiles, got [", begin, ", ", end, ")");
 }
 
-// The grid of tiles of an op's arguments, checked. tile_end: -1 for all tiles.
-inline TileGrid checked_tile_grid(const char* op, std::int64_t n_cameras, std::int64_t width,
-                                  std::int64_t height, std::int64_t tile_size, std::int64_t tile_begin,
-                                  std::int64_t tile_end) {
-  constexpr std::int64_t kMax = std::numeric_limits<std::int32_t>::max();
-  BLITZGS_CHECK(n_cameras >= 0 && n_cameras <= kMax, op, "n_cameras must be at least 0, got ", n_cameras);
-  BLITZGS_CHECK(width > 0 && height > 0 && width <= (1 << 20) && height <= (1 << 20), op,
+// The tiles that an op composites, in its arguments. tile_end: -1 for all tiles.
+#define BLITZGS_TILES                                                                      \
+  std::int64_t n_cameras, std::int64_t width, std::int64_t height, std::int64_t tile_size, \
+      std::int64_t tile_begin, std::int64_t tile_end
+
+inline TileGrid checked_tile_grid(BLITZGS_TILES) {
+  constexpr std::int64_t kMax = INT32_MAX;
+  BLITZGS_CHECK(n_cameras >= 0 && n_cameras <= kMax, "n_cameras must be at least 0, got ", n_cameras);
+  BLITZGS_CHECK(width > 0 && height > 0 && width <= (1 << 20) && height <= (1 << 20),
                 "width and height must be in [1, 2^20], got ", width, " x ", height);
-  BLITZGS_CHECK(tile_size > 0 && tile_size <= 64, op, "tile_size must be in [1, 64], got ", tile_size);
+  BLITZGS_CHECK(tile_size > 0 && tile_size <= 64, "tile_size must be in [1, 64], got ", tile_size);
   const TileGrid grid =
       make_tile_grid(static_cast<int>(n_cameras), static_cast<int>(width), static_cast<int>(height),
                      static_cast<int>(tile_size), tile_begin, tile_end);
-  check_tile_range(op, grid.tile_begin, grid.tile_end, grid.count());
+  check_tile_range(grid.tile_begin, grid.tile_end, grid.count());
   return grid;
 }
 
 // Checks a tensor in pinned memory of the host to which kernels write.
-inline void check_host_values(const char* op, const Tensor& host, std::initializer_list<std::int64_t> shape) {
-  check_in_place(op, "host", host, ScalarType::Long, shape);
-  BLITZGS_CHECK(host.is_cpu(), op, "host must be in pinned memory of the host");
+inline void check_host_values(const Tensor& host, std::initializer_list<std::int64_t> shape) {
+  check_in_place("host", host, ScalarType::Long, shape);
+  BLITZGS_CHECK(host.is_cpu(), "host must be in pinned memory of the host");
 }
 
 }  // namespace blitzgs

@@ -1,6 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <tuple>
-
 #include "common/op.h"
 #include "exchange/scatter.h"
 #include "exchange/tile_costs.h"
@@ -10,16 +8,15 @@
 namespace blitzgs {
 namespace {
 
-SplatGroups checked_groups(const char* op, const char* name, const std::vector<std::int64_t>& sizes) {
+SplatGroups checked_groups(const IntList& sizes) {
   const auto count = static_cast<std::int64_t>(sizes.size());
-  BLITZGS_CHECK(count >= 1 && count <= kMaxRanks, op, name, " must have 1 to ", kMaxRanks, " entries, got ",
+  BLITZGS_CHECK(count >= 1 && count <= kMaxRanks, "group_sizes must have 1 to ", kMaxRanks, " entries, got ",
                 count);
   SplatGroups groups{};
   groups.count = static_cast<int>(count);
   std::int64_t splats = 0;
   for (std::int64_t m = 0; m < count; ++m) {
-    BLITZGS_CHECK(sizes[m] >= 0 && sizes[m] <= std::numeric_limits<std::int32_t>::max(), op, name,
-                  " must be in [0, 2^31), got ", sizes[m]);
+    BLITZGS_CHECK(sizes[m] >= 0 && sizes[m] <= INT32_MAX, "group_sizes must be in [0, 2^31), got ", sizes[m]);
     groups.size[m] = sizes[m];
     groups.start[m] = splats;
     splats += sizes[m];
@@ -33,98 +30,82 @@ std::int64_t total_splats(const SplatGroups& groups) {
 
 // Appends a column with `width` words per splat.
 template <class Word>
-void add_column(const char* op, SplatColumns<Word>& columns, Word* data, std::int64_t width) {
-  BLITZGS_CHECK(columns.count < kMaxSplatColumns, op, "at most ", kMaxSplatColumns, " columns");
+void add_column(SplatColumns<Word>& columns, Word* data, std::int64_t width) {
+  BLITZGS_CHECK(columns.count < kMaxSplatColumns, "at most ", kMaxSplatColumns, " columns");
   const std::int64_t end = columns.begin[columns.count] + width;
-  BLITZGS_CHECK(width >= 0 && end <= 4096, op, "a splat may have 4096 words, got ", end);
+  BLITZGS_CHECK(width >= 0 && end <= 4096, "a splat may have 4096 words, got ", end);
   columns.data[columns.count] = data;
   columns.begin[++columns.count] = static_cast<int>(end);
 }
 
 // Makes a column of `splats` splats for each of the widths and appends it.
 template <class Word>
-std::vector<Tensor> make_columns(const char* op, SplatColumns<Word>& columns, const Tensor& like,
-                                 std::int64_t splats, const std::vector<std::int64_t>& widths) {
-  std::vector<Tensor> found;
+TensorList make_columns(SplatColumns<Word>& columns, const Tensor& like, std::int64_t splats,
+                        const IntList& widths) {
+  TensorList found;
   for (const std::int64_t width : widths) {
-    BLITZGS_CHECK(width >= 0, op, "widths must not be negative, got ", width);
+    BLITZGS_CHECK(width >= 0, "widths must not be negative, got ", width);
     const auto column = make<Word>(like, {splats, width});
     found.push_back(column);
-    add_column(op, columns, column.data(), width);
+    add_column(columns, column.data(), width);
   }
   return found;
 }
-
-// Columns int32 [P, w] and masks int64 [P]; keeps the contiguous forms alive.
-struct HeldSplats {
-  HeldSplats(const char* op, const std::vector<Tensor>& columns, const Tensor& masks_in)
-      : masks(checked<std::int64_t>(op, "masks", masks_in, {-1})) {
-    splats.masks = masks;
-    splats.count = masks.size(0);
-    BLITZGS_CHECK(splats.count <= std::numeric_limits<std::int32_t>::max(), op, splats.count,
-                  " splats exceed 2^31 - 1; project fewer views at a time");
-    for (const Tensor& column : columns) {
-      held.push_back(checked<std::int32_t>(op, "a column", column, {splats.count, -1}));
-      add_column(op, splats.columns, held.back().data(), column.size(1));
-    }
-  }
-
-  Values<const std::int64_t> masks;
-  std::vector<Values<const std::int32_t>> held;
-  ScatterSplats splats{};
-};
 
 SplatPlace* places_of(const Values<std::int64_t>& places) {
   static_assert(sizeof(SplatPlace) == sizeof(std::int64_t));
   return reinterpret_cast<SplatPlace*>(places.data());
 }
 
-std::tuple<Tensor, Tensor> scatter_splats(const std::vector<Tensor>& columns, const Tensor& masks,
-                                          const std::vector<std::int64_t>& group_sizes) {
-  constexpr const char* kOp = "scatter_splats";
-  HeldSplats held(kOp, columns, masks);
-  const SplatGroups groups = checked_groups(kOp, "group_sizes", group_sizes);
-  const auto& columns_in = held.splats.columns;
-  const std::int64_t words = columns_in.begin[columns_in.count];
-  const auto packed = make<std::int32_t>(held.masks, {total_splats(groups) * words});
-  const auto places = make<std::int64_t>(held.masks, {place_runs(held.splats.count), groups.count});
+// columns: int32 [P, w]; masks: int64 [P].
+Tensors<2> scatter_splats(const TensorList& columns, const Tensor& masks_in, const IntList& group_sizes) {
+  const auto masks = checked<std::int64_t>("masks", masks_in, {-1});
+  ScatterSplats splats{{}, masks, masks.size(0)};
+  BLITZGS_CHECK(splats.count <= INT32_MAX, splats.count,
+                " splats exceed 2^31 - 1; project fewer views at a time");
+  std::vector<Values<const std::int32_t>> held;
+  for (const Tensor& column : columns) {
+    held.push_back(checked<std::int32_t>("a column", column, {splats.count, -1}));
+    add_column(splats.columns, held.back().data(), column.size(1));
+  }
+  const SplatGroups groups = checked_groups(group_sizes);
+  const std::int64_t words = splats.columns.begin[splats.columns.count];
+  const auto packed = make<std::int32_t>(masks, {total_splats(groups) * words});
+  const auto places = make<std::int64_t>(masks, {place_runs(splats.count), groups.count});
   ScatterTargets targets{};
   for (int m = 0; m < groups.count; ++m) {
-    for (int c = 0; c < columns_in.count; ++c) {
-      targets.words[m][c] = packed + groups.start[m] * words + groups.size[m] * columns_in.begin[c];
+    for (int c = 0; c < splats.columns.count; ++c) {
+      targets.words[m][c] = packed + groups.start[m] * words + groups.size[m] * splats.columns.begin[c];
     }
   }
-  DeviceScope scope(held.masks);
-  backend::scatter(held.splats, groups, targets, places_of(places), scope.workspace, scope.stream);
+  DeviceScope scope(masks);
+  backend::scatter(splats, groups, targets, places_of(places), scope.workspace, scope.stream);
   return {packed, places};
 }
 
-std::vector<Tensor> gather_splats(const Tensor& packed, const std::vector<std::int64_t>& widths,
-                                  const std::vector<std::int64_t>& group_sizes) {
-  constexpr const char* kOp = "gather_splats";
-  const SplatGroups groups = checked_groups(kOp, "group_sizes", group_sizes);
+TensorList gather_splats(const Tensor& packed, const IntList& widths, const IntList& group_sizes) {
+  const SplatGroups groups = checked_groups(group_sizes);
   const std::int64_t n_splats = total_splats(groups);
   SplatColumns<std::int32_t> columns{};
-  std::vector<Tensor> found = make_columns(kOp, columns, packed, n_splats, widths);
-  const auto words = checked<std::int32_t>(kOp, "packed", packed, {n_splats * columns.begin[columns.count]});
+  TensorList found = make_columns(columns, packed, n_splats, widths);
+  const auto words = checked<std::int32_t>("packed", packed, {n_splats * columns.begin[columns.count]});
   DeviceScope scope(words);
   if (columns.count > 0) backend::gather(words, groups, columns, scope.stream);
   return found;
 }
 
-std::vector<Tensor> sum_splats(const std::vector<Tensor>& values, const Tensor& places_in,
-                               std::int64_t splats, const std::vector<std::int64_t>& widths) {
-  constexpr const char* kOp = "sum_splats";
-  BLITZGS_CHECK(splats >= 0, kOp, "splats must not be negative, got ", splats);
+TensorList sum_splats(const TensorList& values, const Tensor& places_in, std::int64_t splats,
+                      const IntList& widths) {
+  BLITZGS_CHECK(splats >= 0, "splats must not be negative, got ", splats);
   const auto n_ranks = static_cast<std::int64_t>(values.size());
-  BLITZGS_CHECK(n_ranks >= 1 && n_ranks <= kMaxRanks, kOp, "values must have 1 to ", kMaxRanks,
-                " entries, got ", n_ranks);
-  check_floating(kOp, "values", values[0]);
-  const auto places = checked<std::int64_t>(kOp, "places", places_in, {place_runs(splats), n_ranks});
+  BLITZGS_CHECK(n_ranks >= 1 && n_ranks <= kMaxRanks, "values must have 1 to ", kMaxRanks, " entries, got ",
+                n_ranks);
+  check_floating("values", values[0]);
+  const auto places = checked<std::int64_t>("places", places_in, {place_runs(splats), n_ranks});
   DeviceScope scope(values[0]);
   return dispatch_floating(values[0], [&]<class T>() {
     SplatColumns<T> columns{};
-    std::vector<Tensor> sums = make_columns(kOp, columns, values[0], splats, widths);
+    TensorList sums = make_columns(columns, values[0], splats, widths);
     SplatValues<T> in{};
     in.n_ranks = static_cast<int>(n_ranks);
     in.width = columns.begin[columns.count];
@@ -132,7 +113,7 @@ std::vector<Tensor> sum_splats(const std::vector<Tensor>& values, const Tensor& 
     in.places = reinterpret_cast<const SplatPlace*>(places.data());
     std::vector<Values<const T>> held;
     for (std::int64_t m = 0; m < n_ranks; ++m) {
-      held.push_back(checked<T>(kOp, "values of a rank", values[m], {-1, in.width}));
+      held.push_back(checked<T>("values of a rank", values[m], {-1, in.width}));
       in.values[m] = held.back();
       in.size[m] = held.back().size(0);
     }
@@ -144,47 +125,26 @@ std::vector<Tensor> sum_splats(const std::vector<Tensor>& values, const Tensor& 
 #ifdef BLITZGS_BACKEND_CUDA
 
 // Checks that there is one buffer for each rank and that all have the same length and dtype.
-void check_peers(const char* op, const std::vector<Tensor>& buffers, ScalarType dtype) {
+void check_peers(const TensorList& buffers, ScalarType dtype) {
   const auto count = static_cast<std::int64_t>(buffers.size());
-  BLITZGS_CHECK(count >= 1 && count <= kMaxPeers, op, "1 to ", kMaxPeers, " peers are supported, got ",
-                count);
+  BLITZGS_CHECK(count >= 1 && count <= kMaxPeers, "1 to ", kMaxPeers, " peers are supported, got ", count);
   for (const Tensor& buffer : buffers) {
-    check_in_place(op, "a buffer", buffer, dtype, {buffers[0].size(0)});
+    check_in_place("a buffer", buffer, dtype, {buffers[0].size(0)});
   }
 }
 
-// The addresses of the columns in each rank's buffer, for columns with a capacity of `capacity` splats.
-template <class Word>
-ScatterTargets peer_targets(const char* op, const std::vector<Tensor>& buffers,
-                            const SplatColumns<Word>& columns, std::int64_t capacity, int n_ranks) {
-  check_peers(op, buffers, ScalarType::Int);
-  BLITZGS_CHECK(static_cast<int>(buffers.size()) == n_ranks, op, n_ranks, " ranks need as many buffers, got ",
-                buffers.size());
-  BLITZGS_CHECK(capacity >= 0 && capacity <= std::numeric_limits<std::int32_t>::max() &&
-                    capacity * columns.begin[columns.count] <= buffers[0].size(0),
-                op, "", capacity, " splats do not fit into a buffer of ", buffers[0].size(0), " words");
-  ScatterTargets targets{};
-  for (int m = 0; m < n_ranks; ++m) {
-    for (int c = 0; c < columns.count; ++c) {
-      targets.words[m][c] = mutable_data<std::int32_t>(buffers[m]) + capacity * columns.begin[c];
-    }
-  }
-  return targets;
-}
-
-void device_barrier(const std::vector<Tensor>& control, std::int64_t rank, std::int64_t number,
-                    const std::optional<Tensor>& values, std::int64_t first, double timeout_seconds,
-                    const std::optional<Tensor>& host) {
-  constexpr const char* kOp = "device_barrier_";
-  check_peers(kOp, control, ScalarType::Long);
+void device_barrier(const TensorList& control, std::int64_t rank, std::int64_t number,
+                    const OptionalTensor& values, std::int64_t first, double timeout_seconds,
+                    const OptionalTensor& host) {
+  check_peers(control, ScalarType::Long);
   const auto count = static_cast<std::int64_t>(control.size());
-  BLITZGS_CHECK(rank >= 0 && rank < count, kOp, "rank must be in [0, ", count, "), got ", rank);
-  if (values) check_in_place(kOp, "values", *values, ScalarType::Long, {-1});
+  BLITZGS_CHECK(rank >= 0 && rank < count, "rank must be in [0, ", count, "), got ", rank);
+  if (values) check_in_place("values", *values, ScalarType::Long, {-1});
   const std::int64_t n_values = values ? values->size(0) : 0;
-  BLITZGS_CHECK(first >= count && first + (count + 1) * n_values <= control[0].size(0), kOp, n_values,
+  BLITZGS_CHECK(first >= count && first + (count + 1) * n_values <= control[0].size(0), n_values,
                 " values of ", count, " ranks and their sums from word ", first, " on do not fit behind ",
                 count, " words into ", control[0].size(0));
-  if (host) check_host_values(kOp, *host, {count, n_values});
+  if (host) check_host_values(*host, {count, n_values});
   ControlWords words{};
   words.count = static_cast<int>(count);
   words.rank = static_cast<int>(rank);
@@ -195,27 +155,33 @@ void device_barrier(const std::vector<Tensor>& control, std::int64_t rank, std::
 }
 
 void copy_to_host(const Tensor& host, const Tensor& values_in) {
-  constexpr const char* kOp = "copy_to_host_";
-  const auto values = checked_in_place<std::int64_t>(kOp, "values", values_in, {-1});
-  BLITZGS_CHECK(!values.is_cpu(), kOp, "values must be on the GPU");
-  check_host_values(kOp, host, {values.size(0)});
+  const auto values = checked_in_place<std::int64_t>("values", values_in, {-1});
+  BLITZGS_CHECK(!values.is_cpu(), "values must be on the GPU");
+  check_host_values(host, {values.size(0)});
   DeviceScope scope(values);
   cuda::copy_to_host(values, values.size(0), mutable_data<std::int64_t>(host), scope.stream);
 }
 
 // Returns the places and the SendPlan, whose first word is the number of splats that this rank receives.
-std::tuple<Tensor, Tensor> send_splats(const std::vector<Tensor>& columns, const Tensor& rank_masks,
-                                       const Tensor& everyone, std::int64_t rank,
-                                       const std::vector<Tensor>& buffers, std::int64_t capacity) {
-  constexpr const char* kOp = "send_splats_";
+Tensors<2> send_splats(const TensorList& columns, const Tensor& rank_masks, const Tensor& everyone,
+                       std::int64_t rank, const TensorList& buffers, std::int64_t capacity) {
   const auto n_ranks = static_cast<std::int64_t>(buffers.size());
-  BLITZGS_CHECK(columns.size() == static_cast<std::size_t>(kSentColumns.count), kOp,
+  BLITZGS_CHECK(columns.size() == static_cast<std::size_t>(kSentColumns.count),
                 "columns must be means2d, conics, opacities, colors, depths, camera_ids and ids, got ",
                 columns.size());
-  BLITZGS_CHECK(columns[0].size(0) >= capacity, kOp, "columns must have room for ", capacity, " splats, got ",
+  BLITZGS_CHECK(columns[0].size(0) >= capacity, "columns must have room for ", capacity, " splats, got ",
                 columns[0].size(0));
   SendArguments arguments{};
-  arguments.targets = peer_targets(kOp, buffers, kSentColumns, capacity, static_cast<int>(n_ranks));
+  check_peers(buffers, ScalarType::Int);
+  BLITZGS_CHECK(capacity >= 0 && capacity <= INT32_MAX &&
+                    capacity * kSentColumns.begin[kSentColumns.count] <= buffers[0].size(0),
+                capacity, " splats do not fit into a buffer of ", buffers[0].size(0), " words");
+  for (int m = 0; m < n_ranks; ++m) {
+    for (int c = 0; c < kSentColumns.count; ++c) {
+      arguments.targets.words[m][c] =
+          mutable_data<std::int32_t>(buffers[m]) + capacity * kSentColumns.begin[c];
+    }
+  }
   arguments.splats.columns = kSentColumns;
   arguments.splats.count = capacity;
   for (int c = 0; c < kSentColumns.count; ++c) {
@@ -224,14 +190,13 @@ std::tuple<Tensor, Tensor> send_splats(const std::vector<Tensor>& columns, const
     BLITZGS_CHECK(
         column.is_contiguous() && column.size(0) == columns[0].size(0) &&
             column.numel() * static_cast<std::int64_t>(column.element_size()) == 4 * words * column.size(0),
-        kOp, "column ", c, " must be contiguous, of ", words, " words a splat");
+        "column ", c, " must be contiguous, of ", words, " words a splat");
     arguments.splats.columns.data[c] = static_cast<const std::int32_t*>(column.const_data_ptr());
   }
-  arguments.splats.masks =
-      checked_in_place<std::int64_t>(kOp, "rank_masks", rank_masks, {columns[0].size(0)});
-  arguments.everyone = checked_in_place<std::int64_t>(kOp, "everyone", everyone, {n_ranks, -1});
+  arguments.splats.masks = checked_in_place<std::int64_t>("rank_masks", rank_masks, {columns[0].size(0)});
+  arguments.everyone = checked_in_place<std::int64_t>("everyone", everyone, {n_ranks, -1});
   const std::int64_t n_views = everyone.size(1) - project_totals(0, n_ranks);
-  BLITZGS_CHECK(!everyone.is_cpu() && n_views >= 0 && rank >= 0 && rank < n_ranks, kOp,
+  BLITZGS_CHECK(!everyone.is_cpu() && n_views >= 0 && rank >= 0 && rank < n_ranks,
                 "everyone must be on the GPU and the totals of ", n_ranks,
                 " ranks, and rank one of them, got ", rank);
   DeviceScope scope(columns[0]);
@@ -250,18 +215,15 @@ std::tuple<Tensor, Tensor> send_splats(const std::vector<Tensor>& columns, const
 
 // The costs are in the memory of the host for every device that renders.
 
-std::vector<Tensor> tile_costs(const Tensor& sums_in, std::int64_t first, std::int64_t views,
-                               std::int64_t grain) {
-  constexpr const char* kOp = "tile_costs";
-  const auto sums = checked_in_place<float>(kOp, "sums", sums_in, {-1});
-  BLITZGS_CHECK(first >= 0 && first <= sums.size(0), kOp, "first must be in [0, ", sums.size(0), "], got ",
-                first);
+TensorList tile_costs(const Tensor& sums_in, std::int64_t first, std::int64_t views, std::int64_t grain) {
+  const auto sums = checked_in_place<float>("sums", sums_in, {-1});
+  BLITZGS_CHECK(first >= 0 && first <= sums.size(0), "first must be in [0, ", sums.size(0), "], got ", first);
   const std::int64_t costs = sums.size(0) - first;
-  BLITZGS_CHECK(views > 0 && costs % views == 0, kOp, costs, " costs are not those of the tiles of ", views,
+  BLITZGS_CHECK(views > 0 && costs % views == 0, costs, " costs are not those of the tiles of ", views,
                 " views of one size");
-  BLITZGS_CHECK(grain > 0, kOp, "grain must be at least 1, got ", grain);
+  BLITZGS_CHECK(grain > 0, "grain must be at least 1, got ", grain);
   const std::int64_t tiles = costs / views, pieces = (tiles + grain - 1) / grain;
-  std::vector<Tensor> stored;
+  TensorList stored;
   for (std::int64_t view = 0; view < views; ++view) {
     stored.push_back(make_empty(sums, {pieces}, ScalarType::Half));
     cpu::store_tile_costs(sums + first + view * tiles, tiles, grain,
@@ -271,31 +233,27 @@ std::vector<Tensor> tile_costs(const Tensor& sums_in, std::int64_t first, std::i
 }
 
 // Checks the pieces of views and returns their addresses, null for an empty tensor.
-std::vector<const std::uint16_t*> checked_pieces(const char* op, const char* name,
-                                                 const std::vector<Tensor>& views, std::int64_t pieces,
-                                                 bool may_be_empty) {
+std::vector<const std::uint16_t*> checked_pieces(const char* name, const TensorList& views,
+                                                 std::int64_t pieces, bool may_be_empty) {
   std::vector<const std::uint16_t*> found;
   for (const Tensor& view : views) {
     const bool empty = may_be_empty && view.numel() == 0;
-    check_in_place(op, name, view, ScalarType::Half, {empty ? 0 : pieces});
+    check_in_place(name, view, ScalarType::Half, {empty ? 0 : pieces});
     found.push_back(empty ? nullptr : data<std::uint16_t>(view));
   }
   return found;
 }
 
-std::vector<std::int64_t> divide_tiles(const std::vector<Tensor>& costs, const std::vector<Tensor>& similar,
-                                       std::int64_t tiles, std::int64_t grain, double tile_cost,
-                                       std::int64_t parts) {
-  constexpr const char* kOp = "divide_tiles";
-  BLITZGS_CHECK(!costs.empty(), kOp, "there must be views");
-  BLITZGS_CHECK(tiles > 0 && grain > 0, kOp, "tiles and grain must be at least 1, got ", tiles, " and ",
-                grain);
-  BLITZGS_CHECK(parts > 0 && parts <= (1 << 20), kOp, "parts must be 1 to 2^20, got ", parts);
-  BLITZGS_CHECK(tile_cost >= 8, kOp, "sums are exact for a tile_cost from 8 on, got ", tile_cost);
+IntList divide_tiles(const TensorList& costs, const TensorList& similar, std::int64_t tiles,
+                     std::int64_t grain, double tile_cost, std::int64_t parts) {
+  BLITZGS_CHECK(!costs.empty(), "there must be views");
+  BLITZGS_CHECK(tiles > 0 && grain > 0, "tiles and grain must be at least 1, got ", tiles, " and ", grain);
+  BLITZGS_CHECK(parts > 0 && parts <= (1 << 20), "parts must be 1 to 2^20, got ", parts);
+  BLITZGS_CHECK(tile_cost >= 8, "sums are exact for a tile_cost from 8 on, got ", tile_cost);
   const std::int64_t pieces = (tiles + grain - 1) / grain;
-  const auto views = checked_pieces(kOp, "costs of a view", costs, pieces, true);
-  const auto alike = checked_pieces(kOp, "costs of a similar view", similar, pieces, false);
-  std::vector<std::int64_t> bounds(parts + 1);
+  const auto views = checked_pieces("costs of a view", costs, pieces, true);
+  const auto alike = checked_pieces("costs of a similar view", similar, pieces, false);
+  IntList bounds(parts + 1);
   DeviceScope scope(costs[0]);
   cpu::divide_tiles({views.data(), static_cast<std::int64_t>(views.size()), alike.data(),
                      static_cast<std::int64_t>(alike.size()), tiles, grain, static_cast<float>(tile_cost)},
@@ -309,15 +267,15 @@ std::vector<std::int64_t> divide_tiles(const std::vector<Tensor>& costs, const s
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) {
-  m.impl("scatter_splats", TORCH_BOX(&blitzgs::scatter_splats));
-  m.impl("gather_splats", TORCH_BOX(&blitzgs::gather_splats));
-  m.impl("sum_splats", TORCH_BOX(&blitzgs::sum_splats));
+  BLITZGS_OP(m, "scatter_splats", scatter_splats);
+  BLITZGS_OP(m, "gather_splats", gather_splats);
+  BLITZGS_OP(m, "sum_splats", sum_splats);
 #ifdef BLITZGS_BACKEND_CUDA
-  m.impl("device_barrier_", TORCH_BOX(&blitzgs::device_barrier));
-  m.impl("copy_to_host_", TORCH_BOX(&blitzgs::copy_to_host));
-  m.impl("send_splats_", TORCH_BOX(&blitzgs::send_splats));
+  BLITZGS_OP(m, "device_barrier_", device_barrier);
+  BLITZGS_OP(m, "copy_to_host_", copy_to_host);
+  BLITZGS_OP(m, "send_splats_", send_splats);
 #else
-  m.impl("tile_costs", TORCH_BOX(&blitzgs::tile_costs));
-  m.impl("divide_tiles", TORCH_BOX(&blitzgs::divide_tiles));
+  BLITZGS_OP(m, "tile_costs", tile_costs);
+  BLITZGS_OP(m, "divide_tiles", divide_tiles);
 #endif
 }

@@ -19,44 +19,39 @@ void fill_window(T (&window)[kSsimTaps]) {
   for (int i = 0; i < kSsimTaps; ++i) window[i] = static_cast<T>(values[i] / total);
 }
 
-struct PhotometricOutputs {
-  Tensor parts, v_renders, scale_reg, opacity_reg;
-};
-
 // The weights of the sums in the loss whose gradient is computed.
 struct PhotometricWeights {
   const Tensor& l1;
   const Tensor& ssim;
-  std::optional<Tensor> samples, visible;
+  OptionalTensor samples, visible;
   double scale = 0, opacity = 0;
 };
 
 // weights null: no gradient. sums: whether the sums are wanted.
-PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, const Tensor& targets_in,
-                                   const std::optional<Tensor>& masks_in, const PhotometricWeights* weights,
-                                   bool sums, std::int64_t tile_size, std::int64_t tile_begin,
-                                   std::int64_t tile_end) {
-  check_floating(op, "renders", renders_in);
-  check_shape(op, "renders", renders_in, {-1, -1, -1, 3});
+Tensors<4> run_photometric(const Tensor& renders_in, const Tensor& targets_in, const OptionalTensor& masks_in,
+                           const PhotometricWeights* weights, bool sums, std::int64_t tile_size,
+                           std::int64_t tile_begin, std::int64_t tile_end) {
+  check_floating("renders", renders_in);
+  check_shape("renders", renders_in, {-1, -1, -1, 3});
   const std::int64_t views = renders_in.size(0), height = renders_in.size(1), width = renders_in.size(2);
-  check_shape(op, "targets", targets_in, {views, height, width, 3});
+  check_shape("targets", targets_in, {views, height, width, 3});
   const bool bytes = targets_in.scalar_type() == ScalarType::Byte;
-  if (!bytes) check_dtype(op, "targets (if not uint8)", targets_in, renders_in.scalar_type());
+  if (!bytes) check_dtype("targets (if not uint8)", targets_in, renders_in.scalar_type());
   const Tensor targets = as_contiguous(targets_in);
-  BLITZGS_CHECK(tile_size > 0 && tile_size <= 4096, op, "tile_size must be in [1, 4096], got ", tile_size);
-  BLITZGS_CHECK(height < (1 << 24) && width < (1 << 24), op, "images of ", width, " x ", height,
+  BLITZGS_CHECK(tile_size > 0 && tile_size <= 4096, "tile_size must be in [1, 4096], got ", tile_size);
+  BLITZGS_CHECK(height < (1 << 24) && width < (1 << 24), "images of ", width, " x ", height,
                 " pixels are beyond the limit of 2^24 a side");
-  const auto masks = checked<std::uint8_t>(op, "masks", masks_in, {views, height, width});
+  const auto masks = checked<std::uint8_t>("masks", masks_in, {views, height, width});
   DeviceScope scope(renders_in);
-  return dispatch_floating(renders_in, [&]<class T>() {
-    const auto renders = checked<T>(op, "renders", renders_in, {views, height, width, 3});
+  return dispatch_floating(renders_in, [&]<class T>() -> Tensors<4> {
+    const auto renders = checked<T>("renders", renders_in, {views, height, width, 3});
     OptionalValues<const T> l1_weights, ssim_weights, samples;
     OptionalValues<const std::int64_t> visible;
     if (weights) {
-      l1_weights.emplace(checked<T>(op, "l1_weights", weights->l1, {views}));
-      ssim_weights.emplace(checked<T>(op, "ssim_weights", weights->ssim, {views}));
-      samples = checked<T>(op, "samples", weights->samples, {views});
-      visible = checked<std::int64_t>(op, "visible", weights->visible, {views});
+      l1_weights.emplace(checked<T>("l1_weights", weights->l1, {views}));
+      ssim_weights.emplace(checked<T>("ssim_weights", weights->ssim, {views}));
+      samples = checked<T>("samples", weights->samples, {views});
+      visible = checked<std::int64_t>("visible", weights->visible, {views});
     }
     const auto v_renders = make<T>(renders, {weights ? views : 0, height, width, 3});
     auto scale_reg = make<T>(renders, {visible ? views : 0}),
@@ -64,7 +59,7 @@ PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, con
     if (renders.numel() == 0) {
       torch::stable::zero_(scale_reg);
       torch::stable::zero_(opacity_reg);
-      return PhotometricOutputs{make<double>(renders, {views, 0, 2}), v_renders, scale_reg, opacity_reg};
+      return {make<double>(renders, {views, 0, 2}), v_renders, scale_reg, opacity_reg};
     }
     PhotometricArgs<T> args{};
     args.renders = renders;
@@ -89,24 +84,22 @@ PhotometricOutputs run_photometric(const char* op, const Tensor& renders_in, con
     args.tile_begin = tile_begin;
     const std::int64_t tiles = views * args.tiles_x * args.tiles_y;
     args.tile_end = tile_end < 0 ? tiles : tile_end;
-    check_tile_range(op, tile_begin, args.tile_end, tiles);
+    check_tile_range(tile_begin, args.tile_end, tiles);
     fill_window(args.window);
     const auto parts = make<double>(renders, {views, sums ? backend::photometric_parts(args) : 0, 2});
     args.parts = parts.data_if(sums);
     backend::photometric(args, scope.workspace, scope.stream);
-    return PhotometricOutputs{parts, v_renders, scale_reg, opacity_reg};
+    return {parts, v_renders, scale_reg, opacity_reg};
   });
 }
 
-std::tuple<Tensor, Tensor> photometric_fwd(const Tensor& renders, const Tensor& targets,
-                                           const std::optional<Tensor>& masks, std::int64_t tile_size,
-                                           std::int64_t tile_begin, std::int64_t tile_end) {
-  const Tensor parts = run_photometric("photometric_fwd", renders, targets, masks, nullptr, true, tile_size,
-                                       tile_begin, tile_end)
-                           .parts;
+Tensors<2> photometric_fwd(const Tensor& renders, const Tensor& targets, const OptionalTensor& masks,
+                           std::int64_t tile_size, std::int64_t tile_begin, std::int64_t tile_end) {
+  const Tensor parts =
+      std::get<0>(run_photometric(renders, targets, masks, nullptr, true, tile_size, tile_begin, tile_end));
   const std::int64_t views = parts.size(0);
   DeviceScope scope(renders);
-  return dispatch_floating(renders, [&]<class T>() -> std::tuple<Tensor, Tensor> {
+  return dispatch_floating(renders, [&]<class T>() -> Tensors<2> {
     const auto l1_sums = make<T>(renders, {views}), ssim_sums = make<T>(renders, {views});
     const Report<T> report{
         data<double>(parts), views, parts.size(1), nullptr, 0, 0, {{l1_sums, ssim_sums, nullptr}}, 1};
@@ -115,59 +108,52 @@ std::tuple<Tensor, Tensor> photometric_fwd(const Tensor& renders, const Tensor& 
   });
 }
 
-Tensor photometric_bwd(const Tensor& renders, const Tensor& targets, const std::optional<Tensor>& masks,
+Tensor photometric_bwd(const Tensor& renders, const Tensor& targets, const OptionalTensor& masks,
                        const Tensor& l1_weights, const Tensor& ssim_weights, std::int64_t tile_size,
                        std::int64_t tile_begin, std::int64_t tile_end) {
   const PhotometricWeights weights{l1_weights, ssim_weights, {}, {}};
-  return run_photometric("photometric_bwd", renders, targets, masks, &weights, false, tile_size, tile_begin,
-                         tile_end)
-      .v_renders;
+  return std::get<1>(
+      run_photometric(renders, targets, masks, &weights, false, tile_size, tile_begin, tile_end));
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor> photometric_fwd_bwd(
-    const Tensor& renders, const Tensor& targets, const std::optional<Tensor>& masks,
-    const Tensor& l1_weights, const Tensor& ssim_weights, std::int64_t tile_size, std::int64_t tile_begin,
-    std::int64_t tile_end, const std::optional<Tensor>& samples, const std::optional<Tensor>& visible,
-    double scale_weight, double opacity_weight) {
+Tensors<4> photometric_fwd_bwd(const Tensor& renders, const Tensor& targets, const OptionalTensor& masks,
+                               const Tensor& l1_weights, const Tensor& ssim_weights, std::int64_t tile_size,
+                               std::int64_t tile_begin, std::int64_t tile_end, const OptionalTensor& samples,
+                               const OptionalTensor& visible, double scale_weight, double opacity_weight) {
   const PhotometricWeights weights{l1_weights, ssim_weights, samples, visible, scale_weight, opacity_weight};
-  const PhotometricOutputs out = run_photometric("photometric_fwd_bwd", renders, targets, masks, &weights,
-                                                 true, tile_size, tile_begin, tile_end);
-  return {out.parts, out.v_renders, out.scale_reg, out.opacity_reg};
+  return run_photometric(renders, targets, masks, &weights, true, tile_size, tile_begin, tile_end);
 }
 
-std::tuple<Tensor, Tensor> l1_ssim_fwd_bwd(const Tensor& renders, const Tensor& targets,
-                                           const Tensor& l1_weights, const Tensor& ssim_weights,
-                                           const Tensor& samples, double l1_factor, double ssim_factor,
-                                           double offset) {
+Tensors<2> l1_ssim_fwd_bwd(const Tensor& renders, const Tensor& targets, const Tensor& l1_weights,
+                           const Tensor& ssim_weights, const Tensor& samples, double l1_factor,
+                           double ssim_factor, double offset) {
   const PhotometricWeights weights{l1_weights, ssim_weights, samples, {}};
-  const PhotometricOutputs out =
-      run_photometric("l1_ssim_fwd_bwd", renders, targets, std::nullopt, &weights, true, 16, 0, -1);
-  const std::int64_t n = out.parts.size(0) * out.parts.size(1);
+  const Tensors<4> out = run_photometric(renders, targets, std::nullopt, &weights, true, 16, 0, -1);
+  const Tensor& parts = std::get<0>(out);
+  const std::int64_t n = parts.size(0) * parts.size(1);
   DeviceScope scope(renders);
-  return dispatch_floating(renders, [&]<class T>() -> std::tuple<Tensor, Tensor> {
+  return dispatch_floating(renders, [&]<class T>() -> Tensors<2> {
     const auto loss = make<T>(renders, {});
-    backend::loss_of_sums(LossOfSums<T>{data<double>(out.parts), n, l1_factor, ssim_factor, offset, loss},
+    backend::loss_of_sums(LossOfSums<T>{data<double>(parts), n, l1_factor, ssim_factor, offset, loss},
                           scope.stream);
-    return {loss, out.v_renders};
+    return {loss, std::get<1>(out)};
   });
 }
 
-void report_(const std::optional<Tensor>& parts_in, const std::optional<Tensor>& tile_work_in,
-             std::int64_t tile_begin, std::int64_t tile_end, std::int64_t rank, std::int64_t n_ranks,
-             const std::vector<Tensor>& targets) {
-  constexpr const char* kOp = "report_";
-  const auto parts = checked<double>(kOp, "parts", parts_in, {-1, -1, 2});
-  const auto tile_work = checked<std::int32_t>(kOp, "tile_work", tile_work_in, {-1});
+void report_(const OptionalTensor& parts_in, const OptionalTensor& tile_work_in, std::int64_t tile_begin,
+             std::int64_t tile_end, std::int64_t rank, std::int64_t n_ranks, const TensorList& targets) {
+  const auto parts = checked<double>("parts", parts_in, {-1, -1, 2});
+  const auto tile_work = checked<std::int32_t>("tile_work", tile_work_in, {-1});
   const std::int64_t tiles = tile_work ? tile_work->size(0) : 0;
   Report<float> report{
       parts, parts ? parts->size(0) : 0, parts ? parts->size(1) : 0, tile_work, tile_begin, tile_end, {}, 0};
-  check_tile_range(kOp, tile_begin, tile_end, tiles);
-  BLITZGS_CHECK(rank >= 0 && rank < n_ranks, kOp, "rank must be in [0, ", n_ranks, "), got ", rank);
+  check_tile_range(tile_begin, tile_end, tiles);
+  BLITZGS_CHECK(rank >= 0 && rank < n_ranks, "rank must be in [0, ", n_ranks, "), got ", rank);
   const auto count = static_cast<std::int64_t>(targets.size());
-  BLITZGS_CHECK(count > 0 && count <= kMaxReportTargets, kOp, "1 to ", kMaxReportTargets,
+  BLITZGS_CHECK(count > 0 && count <= kMaxReportTargets, "1 to ", kMaxReportTargets,
                 " targets are supported, got ", count);
   for (const Tensor& target : targets) {
-    float* sums = checked_in_place<float>(kOp, "a target", target, {2 * report.views * n_ranks + tiles});
+    float* sums = checked_in_place<float>("a target", target, {2 * report.views * n_ranks + tiles});
     float* mine = sums + 2 * report.views * rank;
     report.targets[report.n_targets++] = {mine, mine + report.views, sums + 2 * report.views * n_ranks};
   }
@@ -179,9 +165,9 @@ void report_(const std::optional<Tensor>& parts_in, const std::optional<Tensor>&
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) {
-  m.impl("photometric_fwd", TORCH_BOX(&blitzgs::photometric_fwd));
-  m.impl("photometric_bwd", TORCH_BOX(&blitzgs::photometric_bwd));
-  m.impl("photometric_fwd_bwd", TORCH_BOX(&blitzgs::photometric_fwd_bwd));
-  m.impl("l1_ssim_fwd_bwd", TORCH_BOX(&blitzgs::l1_ssim_fwd_bwd));
-  m.impl("report_", TORCH_BOX(&blitzgs::report_));
+  BLITZGS_OP(m, "photometric_fwd", photometric_fwd);
+  BLITZGS_OP(m, "photometric_bwd", photometric_bwd);
+  BLITZGS_OP(m, "photometric_fwd_bwd", photometric_fwd_bwd);
+  BLITZGS_OP(m, "l1_ssim_fwd_bwd", l1_ssim_fwd_bwd);
+  BLITZGS_OP(m, "report_", report_);
 }

@@ -4,7 +4,6 @@
 #include <bit>
 
 #include "common/op.h"
-#include "common/rows.h"
 #include "population/columns.h"
 #include "population/knn.h"
 #include "population/placement.h"
@@ -15,24 +14,22 @@ namespace {
 
 void density_stats_(const Tensor& grad_sum, const Tensor& grad_count, const Tensor& max_radii,
                     const Tensor& visible_ids_in, const Tensor& splat_offsets_in, const Tensor& v_means2d_in,
-                    const Tensor& conics_in, const std::optional<Tensor>& phi_in, std::int64_t width,
+                    const Tensor& conics_in, const OptionalTensor& phi_in, std::int64_t width,
                     std::int64_t height, double weight) {
-  constexpr const char* kOp = "density_stats_";
-  check_floating(kOp, "grad_sum", grad_sum);
-  const auto visible_ids = checked<std::int32_t>(kOp, "visible_ids", visible_ids_in, {-1});
+  check_floating("grad_sum", grad_sum);
+  const auto visible_ids = checked<std::int32_t>("visible_ids", visible_ids_in, {-1});
   const std::int64_t rows = grad_sum.numel(), visible = visible_ids.size(0);
-  const auto splat_offsets = checked<std::int32_t>(kOp, "splat_offsets", splat_offsets_in, {visible + 1});
-  DeviceScope scope(grad_sum);
+  const auto splat_offsets = checked<std::int32_t>("splat_offsets", splat_offsets_in, {visible + 1});
   dispatch_floating(grad_sum, [&]<class T>() {
-    const auto conics = checked<T>(kOp, "conics", conics_in, {-1, 3});
-    const auto phi = checked<T>(kOp, "phi", phi_in, {rows});
-    check_dtype(kOp, "v_means2d", v_means2d_in, dtype_of<T>::value);
-    check_shape(kOp, "v_means2d", v_means2d_in, {conics.size(0), 2});
+    const auto conics = checked<T>("conics", conics_in, {-1, 3});
+    const auto phi = checked<T>("phi", phi_in, {rows});
+    check_dtype("v_means2d", v_means2d_in, dtype_of<T>::value);
+    check_shape("v_means2d", v_means2d_in, {conics.size(0), 2});
     // If v_means2d is a part of the rows of a gradient table, the kernel reads it there, without a copy.
     const Tensor v_means2d = v_means2d_in.stride(1) == 1 ? v_means2d_in : as_contiguous(v_means2d_in);
-    const DensityStats<T> args{checked_in_place<T>(kOp, "grad_sum", grad_sum, {rows}),
-                               checked_in_place<std::int32_t>(kOp, "grad_count", grad_count, {rows}),
-                               checked_in_place<T>(kOp, "max_radii", max_radii, {rows}),
+    const DensityStats<T> args{checked_in_place<T>("grad_sum", grad_sum, {rows}),
+                               checked_in_place<std::int32_t>("grad_count", grad_count, {rows}),
+                               checked_in_place<T>("max_radii", max_radii, {rows}),
                                visible_ids,
                                splat_offsets,
                                data<T>(v_means2d),
@@ -43,150 +40,134 @@ void density_stats_(const Tensor& grad_sum, const Tensor& grad_count, const Tens
                                static_cast<T>(width) / 2,
                                static_cast<T>(height) / 2,
                                static_cast<T>(weight)};
-    if (visible > 0) backend::for_each_row(args, scope.stream);
+    if (visible > 0) run_rows(grad_sum, args);
   });
 }
 
 // Copies n rows of `column` (null: zeros) to `out`; from and to: columns.h.
-void copy_rows(const char* op, const Tensor& out, const std::int64_t* to, const void* column,
-               const std::int64_t* from, std::int64_t n, CudaStream stream) {
+void copy_rows(const Tensor& out, const std::int64_t* to, const void* column, const std::int64_t* from,
+               std::int64_t n, CudaStream stream) {
   const std::int64_t row_bytes = elements_behind(out) * static_cast<std::int64_t>(out.element_size());
-  BLITZGS_CHECK(row_bytes < (1 << 16), op, "rows must be shorter than 64 KiB, got ", row_bytes, " bytes");
+  BLITZGS_CHECK(row_bytes < (1 << 16), "rows must be shorter than 64 KiB, got ", row_bytes, " bytes");
   backend::copy_rows({static_cast<const std::byte*>(column), from,
                       static_cast<std::byte*>(out.mutable_data_ptr()), to, n, row_bytes},
                      stream);
 }
 
 // Checks that there are n rows like those of `column`.
-void check_rows(const char* op, const char* name, const Tensor& rows, std::int64_t n, const Tensor& column) {
-  check_dtype(op, name, rows, column.scalar_type());
-  BLITZGS_CHECK(rows.dim() == column.dim() && elements_behind(rows) == elements_behind(column), op,
-                "rows of ", name, " must be like those of column, got ", shape_of(rows), " for ",
-                shape_of(column));
-  BLITZGS_CHECK(rows.size(0) == n, op, name, " must have ", n, " rows, got ", shape_of(rows));
+void check_rows(const char* name, const Tensor& rows, std::int64_t n, const Tensor& column) {
+  check_dtype(name, rows, column.scalar_type());
+  BLITZGS_CHECK(rows.dim() == column.dim() && elements_behind(rows) == elements_behind(column), "rows of ",
+                name, " must be like those of column, got ", shape_of(rows), " for ", shape_of(column));
+  BLITZGS_CHECK(rows.size(0) == n, name, " must have ", n, " rows, got ", shape_of(rows));
 }
 
 // Checks a column on the device of `rows`.
-void check_column(const char* op, const char* name, const Tensor& column, const Tensor& rows) {
-  BLITZGS_CHECK(column.dim() >= 1, op, name, " must have rows, got ", shape_of(column));
-  check_device(op, name, column, rows, "rows");
+void check_column(const char* name, const Tensor& column, const Tensor& rows) {
+  BLITZGS_CHECK(column.dim() >= 1, name, " must have rows, got ", shape_of(column));
+  check_device(name, column, rows, "rows");
 }
 
 // check_column() of a column that the op writes in its own memory.
-void check_written(const char* op, const char* name, const Tensor& written, const Tensor& rows) {
-  check_column(op, name, written, rows);
-  check_contiguous(op, name, written);
+void check_written(const char* name, const Tensor& written, const Tensor& rows) {
+  check_column(name, written, rows);
+  check_contiguous(name, written);
 }
 
-void take_rows_(const std::vector<Tensor>& out, const std::vector<Tensor>& columns, const Tensor& rows_in) {
-  constexpr const char* kOp = "take_rows";
-  BLITZGS_CHECK(out.size() == columns.size(), kOp, "there must be as many out as columns, got ", out.size(),
+void take_rows_(const TensorList& out, const TensorList& columns, const Tensor& rows_in) {
+  BLITZGS_CHECK(out.size() == columns.size(), "there must be as many out as columns, got ", out.size(),
                 " for ", columns.size());
-  const auto rows = checked<std::int64_t>(kOp, "rows", rows_in, {-1});
+  const auto rows = checked<std::int64_t>("rows", rows_in, {-1});
   DeviceScope scope(rows);
   for (std::size_t c = 0; c < columns.size(); ++c) {
-    check_column(kOp, "column", columns[c], rows);
-    check_written(kOp, "out", out[c], rows);
-    check_rows(kOp, "out", out[c], rows.size(0), columns[c]);
+    check_column("column", columns[c], rows);
+    check_written("out", out[c], rows);
+    check_rows("out", out[c], rows.size(0), columns[c]);
     const Tensor column = as_contiguous(columns[c]);
-    copy_rows(kOp, out[c], nullptr, column.const_data_ptr(), rows, rows.size(0), scope.stream);
+    copy_rows(out[c], nullptr, column.const_data_ptr(), rows, rows.size(0), scope.stream);
   }
 }
 
-void put_rows_(const std::vector<Tensor>& columns, const Tensor& rows_in, const std::vector<Tensor>& fresh) {
-  constexpr const char* kOp = "put_rows_";
-  BLITZGS_CHECK(fresh.empty() || fresh.size() == columns.size(), kOp,
+void put_rows_(const TensorList& columns, const Tensor& rows_in, const TensorList& fresh) {
+  BLITZGS_CHECK(fresh.empty() || fresh.size() == columns.size(),
                 "fresh must be empty or as many as columns, got ", fresh.size(), " for ", columns.size());
-  const auto rows = checked<std::int64_t>(kOp, "rows", rows_in, {-1});
+  const auto rows = checked<std::int64_t>("rows", rows_in, {-1});
   const std::int64_t n = rows.size(0);
   DeviceScope scope(rows);
   for (std::size_t c = 0; c < columns.size(); ++c) {
-    check_written(kOp, "column", columns[c], rows);
+    check_written("column", columns[c], rows);
     if (fresh.empty()) {
-      copy_rows(kOp, columns[c], rows, nullptr, nullptr, n, scope.stream);
+      copy_rows(columns[c], rows, nullptr, nullptr, n, scope.stream);
       continue;
     }
-    check_device(kOp, "fresh", fresh[c], rows, "rows");
-    check_rows(kOp, "fresh", fresh[c], n, columns[c]);
+    check_device("fresh", fresh[c], rows, "rows");
+    check_rows("fresh", fresh[c], n, columns[c]);
     const Tensor values = as_contiguous(fresh[c]);
-    copy_rows(kOp, columns[c], rows, values.const_data_ptr(), nullptr, n, scope.stream);
+    copy_rows(columns[c], rows, values.const_data_ptr(), nullptr, n, scope.stream);
   }
 }
 
-Tensor hash_with_key(const Tensor& hashes_in, const std::optional<Tensor>& keys_in, std::int64_t number) {
-  constexpr const char* kOp = "hash_key";
-  const auto hashes = checked<std::int64_t>(kOp, "hashes", hashes_in, {-1});
+Tensor hash_with_key(const Tensor& hashes_in, const OptionalTensor& keys_in, std::int64_t number) {
+  const auto hashes = checked<std::int64_t>("hashes", hashes_in, {-1});
   const std::int64_t n = hashes.size(0);
-  const auto keys = checked<std::int64_t>(kOp, "keys", keys_in, {n});
+  const auto keys = checked<std::int64_t>("keys", keys_in, {n});
   const auto out = make<std::int64_t>(hashes, {n});
-  DeviceScope scope(hashes);
-  backend::for_each_row(HashKey{hashes, keys, number, n, out}, scope.stream);
+  run_rows(hashes, HashKey{hashes, keys, number, n, out});
   return out;
 }
 
 Tensor overlap(const Tensor& opacities_in, const Tensor& copies_in) {
-  constexpr const char* kOp = "overlap";
-  const auto opacities = checked<double>(kOp, "opacities", opacities_in, {-1});
+  const auto opacities = checked<double>("opacities", opacities_in, {-1});
   const std::int64_t n = opacities.size(0);
-  const auto copies = checked<std::int64_t>(kOp, "copies", copies_in, {n});
+  const auto copies = checked<std::int64_t>("copies", copies_in, {n});
   const auto overlaps = make<double>(opacities, {n});
-  DeviceScope scope(opacities);
-  backend::for_each_row(Overlap{opacities, copies, n, overlaps}, scope.stream);
+  run_rows(opacities, Overlap{opacities, copies, n, overlaps});
   return overlaps;
 }
 
 Tensor draw_weights(const Tensor& opacities_in, const Tensor& causes_in) {
-  constexpr const char* kOp = "draw_weights";
-  const auto opacities = checked<float>(kOp, "opacities", opacities_in, {-1});
+  const auto opacities = checked<float>("opacities", opacities_in, {-1});
   const std::int64_t n = opacities.size(0);
-  const auto causes = checked<std::uint8_t>(kOp, "causes", causes_in, {n});
+  const auto causes = checked<std::uint8_t>("causes", causes_in, {n});
   const auto weights = make<std::int64_t>(opacities, {n});
-  DeviceScope scope(opacities);
-  backend::for_each_row(DrawWeights{opacities, causes, n, weights}, scope.stream);
+  run_rows(opacities, DrawWeights{opacities, causes, n, weights});
   return weights;
 }
 
-std::tuple<Tensor, Tensor> residual_draws(const Tensor& weights_in, const Tensor& ids_in, std::int64_t draws,
-                                          std::int64_t total, std::int64_t seed, std::int64_t event) {
-  constexpr const char* kOp = "residual_draws";
-  const auto weights = checked<std::int64_t>(kOp, "weights", weights_in, {-1});
+Tensors<2> residual_draws(const Tensor& weights_in, const Tensor& ids_in, std::int64_t draws,
+                          std::int64_t total, std::int64_t seed, std::int64_t event) {
+  const auto weights = checked<std::int64_t>("weights", weights_in, {-1});
   const std::int64_t n = weights.size(0);
-  const auto ids = checked<std::int64_t>(kOp, "ids", ids_in, {n});
-  BLITZGS_CHECK(total > 0, kOp, "total must be positive, got ", total);
+  const auto ids = checked<std::int64_t>("ids", ids_in, {n});
+  BLITZGS_CHECK(total > 0, "total must be positive, got ", total);
   const auto whole = make<std::int64_t>(weights, {n});
   const auto keys = make<float>(weights, {n});
-  DeviceScope scope(weights);
-  backend::for_each_row(ResidualDraws{weights, ids, n, draws, total, seed, event, whole, keys}, scope.stream);
+  run_rows(weights, ResidualDraws{weights, ids, n, draws, total, seed, event, whole, keys});
   return {whole, keys};
 }
 
-void share_rows_(const Tensor& opacities_in, const Tensor& scales, const std::vector<Tensor>& moments,
+void share_rows_(const Tensor& opacities_in, const Tensor& scales, const TensorList& moments,
                  const Tensor& rows_in, const Tensor& copies_in, double least) {
-  constexpr const char* kOp = "share_rows_";
-  const auto opacities = checked_in_place<float>(kOp, "opacities", opacities_in, {-1});
+  const auto opacities = checked_in_place<float>("opacities", opacities_in, {-1});
   const std::int64_t count = opacities.size(0);
-  const auto rows = checked<std::int64_t>(kOp, "rows", rows_in, {-1});
+  const auto rows = checked<std::int64_t>("rows", rows_in, {-1});
   const std::int64_t n = rows.size(0);
-  const auto copies = checked<std::int64_t>(kOp, "copies", copies_in, {n});
+  const auto copies = checked<std::int64_t>("copies", copies_in, {n});
   constexpr std::size_t kParameters = ShareMoments::kColumns + 1, kOpacity = 3;
-  BLITZGS_CHECK(moments.size() == 2 * kParameters, kOp, "there must be ", 2 * kParameters, " moments, got ",
+  BLITZGS_CHECK(moments.size() == 2 * kParameters, "there must be ", 2 * kParameters, " moments, got ",
                 moments.size());
-#ifdef BLITZGS_BACKEND_CUDA
-  constexpr int kLanes = 16;
-#else
-  constexpr int kLanes = 1;
-#endif
+  constexpr int kLanes = kOnCuda ? 16 : 1;
   ShareMoments scaled{{}, {}, rows, copies, kLanes, n * kLanes};
   float* of_opacity[2];
   for (std::size_t c = 0; c < moments.size(); ++c) {
-    check_dtype(kOp, "a moment", moments[c], ScalarType::Float);
-    check_written(kOp, "a moment", moments[c], rows);
-    BLITZGS_CHECK(moments[c].size(0) == count, kOp, "a moment must have ", count, " rows, got ",
+    check_dtype("a moment", moments[c], ScalarType::Float);
+    check_written("a moment", moments[c], rows);
+    BLITZGS_CHECK(moments[c].size(0) == count, "a moment must have ", count, " rows, got ",
                   shape_of(moments[c]));
     float* const values = mutable_data<float>(moments[c]);
     const std::size_t parameter = c % kParameters, order = c / kParameters;
     if (parameter == kOpacity) {
-      check_shape(kOp, "a moment of the opacity", moments[c], {count});
+      check_shape("a moment of the opacity", moments[c], {count});
       of_opacity[order] = values;
     } else {
       auto& columns = order == 0 ? scaled.avgs : scaled.avg_sqs;
@@ -194,60 +175,51 @@ void share_rows_(const Tensor& opacities_in, const Tensor& scales, const std::ve
     }
   }
   const ShareRows shared{opacities,
-                         checked_in_place<float>(kOp, "scales", scales, {count, 3}),
+                         checked_in_place<float>("scales", scales, {count, 3}),
                          of_opacity[0],
                          of_opacity[1],
                          rows,
                          copies,
                          n,
                          static_cast<float>(least)};
-  DeviceScope scope(opacities);
-  backend::for_each_row(scaled, scope.stream);
-  backend::for_each_row(shared, scope.stream);
+  run_rows(opacities, scaled);
+  run_rows(opacities, shared);
 }
 
 Tensor bracket_keys(const Tensor& gone_in, const Tensor& blocks_in) {
-  constexpr const char* kOp = "bracket_keys";
-  const auto gone = checked<std::int64_t>(kOp, "gone", gone_in, {-1});
-  const auto blocks = checked<std::int64_t>(kOp, "blocks", blocks_in, {-1});
+  const auto gone = checked<std::int64_t>("gone", gone_in, {-1});
+  const auto blocks = checked<std::int64_t>("blocks", blocks_in, {-1});
   const std::int64_t leaving = gone.size(0), joining = blocks.size(0), n = leaving + joining;
   const auto keys = make<std::int64_t>(gone, {n});
-  DeviceScope scope(gone);
-  backend::for_each_row(BracketKeys{gone, blocks, leaving, joining, n, keys}, scope.stream);
+  run_rows(gone, BracketKeys{gone, blocks, leaving, joining, n, keys});
   return keys;
 }
 
 void match_brackets_(const Tensor& rows_in, const Tensor& is_left_in, const Tensor& keys_in,
                      const Tensor& order_in, const Tensor& gone_in, const Tensor& by_block_in) {
-  constexpr const char* kOp = "match_brackets_";
-  const auto gone = checked<std::int64_t>(kOp, "gone", gone_in, {-1});
-  const auto by_block = checked<std::int64_t>(kOp, "by_block", by_block_in, {-1});
+  const auto gone = checked<std::int64_t>("gone", gone_in, {-1});
+  const auto by_block = checked<std::int64_t>("by_block", by_block_in, {-1});
   const std::int64_t leaving = gone.size(0), joining = by_block.size(0), n = leaving + joining;
-  const auto keys = checked<std::int64_t>(kOp, "keys", keys_in, {n});
-  const auto order = checked<std::int64_t>(kOp, "order", order_in, {n});
-  const auto rows = checked_in_place<std::int64_t>(kOp, "rows", rows_in, {joining});
-  const auto is_left = checked_in_place<bool>(kOp, "is_left", is_left_in, {leaving});
-  DeviceScope scope(gone);
+  const auto keys = checked<std::int64_t>("keys", keys_in, {n});
+  const auto order = checked<std::int64_t>("order", order_in, {n});
+  const auto rows = checked_in_place<std::int64_t>("rows", rows_in, {joining});
+  const auto is_left = checked_in_place<bool>("is_left", is_left_in, {leaving});
   const std::int64_t neighbours = n > 0 ? n - 1 : 0;
-  backend::for_each_row(MatchBrackets{keys, order, gone, by_block, leaving, neighbours, n + 1, rows, is_left},
-                        scope.stream);
+  run_rows(gone, MatchBrackets{keys, order, gone, by_block, leaving, neighbours, n + 1, rows, is_left});
 }
 
 Tensor sampling_keys(const Tensor& weights_in, const Tensor& ids_in, std::int64_t seed, std::int64_t event) {
-  constexpr const char* kOp = "sampling_keys";
-  const auto weights = checked<float>(kOp, "weights", weights_in, {-1});
-  const auto ids = checked<std::int64_t>(kOp, "ids", ids_in, {weights.size(0)});
+  const auto weights = checked<float>("weights", weights_in, {-1});
+  const auto ids = checked<std::int64_t>("ids", ids_in, {weights.size(0)});
   const auto keys = make<float>(weights, {weights.size(0)});
-  DeviceScope scope(weights);
-  backend::for_each_row(SamplingKeys{weights, ids, weights.size(0), seed, event, keys}, scope.stream);
+  run_rows(weights, SamplingKeys{weights, ids, weights.size(0), seed, event, keys});
   return keys;
 }
 
 Tensor key_histogram(const Tensor& keys_in, const Tensor& prefix_in, std::int64_t shift, std::int64_t width) {
-  constexpr const char* kOp = "key_histogram";
-  const auto keys = checked<float>(kOp, "keys", keys_in, {-1});
-  const auto prefix = checked<std::int64_t>(kOp, "prefix", prefix_in, {1});
-  BLITZGS_CHECK(width >= 1 && width <= kMaxDigitBits && shift >= 0 && shift + width <= 32, kOp,
+  const auto keys = checked<float>("keys", keys_in, {-1});
+  const auto prefix = checked<std::int64_t>("prefix", prefix_in, {1});
+  BLITZGS_CHECK(width >= 1 && width <= kMaxDigitBits && shift >= 0 && shift + width <= 32,
                 "a digit must have 1 to ", kMaxDigitBits, " of 32 bits, got ", width, " after ", shift);
   const auto counts = make<std::int64_t>(keys, {std::int64_t{1} << width});
   DeviceScope scope(keys);
@@ -257,34 +229,30 @@ Tensor key_histogram(const Tensor& keys_in, const Tensor& prefix_in, std::int64_
 }
 
 void find_digit_(const Tensor& search_in, const Tensor& counts_in) {
-  constexpr const char* kOp = "find_digit_";
-  const auto search = checked_in_place<std::int64_t>(kOp, "search", search_in, {3});
-  const auto counts = checked<std::int64_t>(kOp, "counts", counts_in, {-1});
+  const auto search = checked_in_place<std::int64_t>("search", search_in, {3});
+  const auto counts = checked<std::int64_t>("counts", counts_in, {-1});
   const auto n = static_cast<std::uint64_t>(counts.size(0));
-  BLITZGS_CHECK(std::has_single_bit(n), kOp, "there must be a power of two counts, got ", n);
+  BLITZGS_CHECK(std::has_single_bit(n), "there must be a power of two counts, got ", n);
   DeviceScope scope(search);
   backend::find_digit({counts, std::countr_zero(n), search}, scope.stream);
 }
 
 Tensor keys_up_to(const Tensor& keys_in, const Tensor& limit_in) {
-  constexpr const char* kOp = "keys_up_to";
-  const auto keys = checked<float>(kOp, "keys", keys_in, {-1});
-  const auto limit = checked<std::int64_t>(kOp, "limit", limit_in, {1});
+  const auto keys = checked<float>("keys", keys_in, {-1});
+  const auto limit = checked<std::int64_t>("limit", limit_in, {1});
   const std::int64_t n = keys.size(0);
   const auto marks = make<bool>(keys, {n});
-  DeviceScope scope(keys);
-  backend::for_each_row(KeysUpTo{keys, limit, n, marks}, scope.stream);
+  run_rows(keys, KeysUpTo{keys, limit, n, marks});
   return marks;
 }
 
-Tensor find_non_finite(const std::vector<Tensor>& columns_in, const std::vector<Tensor>& nonzero_in) {
-  constexpr const char* kOp = "find_non_finite";
-  BLITZGS_CHECK(!columns_in.empty(), kOp, "there must be columns");
-  std::vector<Tensor> columns;
-  for (const std::vector<Tensor>* list : {&columns_in, &nonzero_in}) {
+Tensor find_non_finite(const TensorList& columns_in, const TensorList& nonzero_in) {
+  BLITZGS_CHECK(!columns_in.empty(), "there must be columns");
+  TensorList columns;
+  for (const TensorList* list : {&columns_in, &nonzero_in}) {
     for (const Tensor& column : *list) {
-      check_floating(kOp, "a column", column);
-      check_dtype(kOp, "a column", column, columns_in[0].scalar_type());
+      check_floating("a column", column);
+      check_dtype("a column", column, columns_in[0].scalar_type());
       columns.push_back(as_contiguous(column));
     }
   }
@@ -307,14 +275,13 @@ constexpr std::int64_t kMaxFeatures = 32;  // the features of a block's rows are
 
 Tensor tree_sums(const Tensor& features_in, const Tensor& roots_in, const Tensor& nodes_in,
                  const Tensor& leaves_in, std::int64_t depth) {
-  constexpr const char* kOp = "tree_sums";
-  const auto features = checked<float>(kOp, "features", features_in, {-1, -1});
-  const auto roots = checked<std::int32_t>(kOp, "roots", roots_in, {-1}),
-             nodes = checked<std::int32_t>(kOp, "nodes", nodes_in, {-1, 4});
-  const auto leaves = checked<std::int64_t>(kOp, "leaves", leaves_in, {nodes.size(0)});
+  const auto features = checked<float>("features", features_in, {-1, -1});
+  const auto roots = checked<std::int32_t>("roots", roots_in, {-1}),
+             nodes = checked<std::int32_t>("nodes", nodes_in, {-1, 4});
+  const auto leaves = checked<std::int64_t>("leaves", leaves_in, {nodes.size(0)});
   const std::int64_t rows = features.size(0), n_features = features.size(1);
-  BLITZGS_CHECK(n_features <= kMaxFeatures, kOp, "at most ", kMaxFeatures, " features, got ", n_features);
-  BLITZGS_CHECK(depth >= 0, kOp, "depth must not be negative, got ", depth);
+  BLITZGS_CHECK(n_features <= kMaxFeatures, "at most ", kMaxFeatures, " features, got ", n_features);
+  BLITZGS_CHECK(depth >= 0, "depth must not be negative, got ", depth);
   const auto sums = make<std::int64_t>(features, {rows});
   DeviceScope scope(features);
   backend::tree_sums({features, roots, reinterpret_cast<const TreeNode*>(nodes.data()), leaves, rows,
@@ -323,28 +290,24 @@ Tensor tree_sums(const Tensor& features_in, const Tensor& roots_in, const Tensor
   return sums;
 }
 
-Tensor spawn_features(const std::vector<Tensor>& columns, const Tensor& rows_in, const Tensor& is_split_in,
+Tensor spawn_features(const TensorList& columns, const Tensor& rows_in, const Tensor& is_split_in,
                       std::int64_t time, double extent, std::int64_t level_count) {
-  constexpr const char* kOp = "spawn_features";
-  BLITZGS_CHECK(columns.size() == 7, kOp,
-                "columns must be (grad_sum, grad_count, opacities, scales, birth, level, "
-                "exp_avg_sq.sh), got ",
-                columns.size(), " tensors");
+  check_group("columns (grad_sum, grad_count, opacities, scales, birth, level, exp_avg_sq.sh)", columns, 7,
+              7);
   const std::int64_t n = columns[0].size(0);
-  const auto grad_sum = checked<float>(kOp, "grad_sum", columns[0], {n}),
-             opacities = checked<float>(kOp, "opacities", columns[2], {n}),
-             scales = checked<float>(kOp, "scales", columns[3], {n, 3}),
-             moments = checked<float>(kOp, "exp_avg_sq.sh", columns[6], {n, -1, 3});
-  const auto grad_count = checked<std::int32_t>(kOp, "grad_count", columns[1], {n}),
-             birth = checked<std::int32_t>(kOp, "birth", columns[4], {n});
-  const auto level = checked<std::uint8_t>(kOp, "level", columns[5], {n});
-  BLITZGS_CHECK(moments.size(1) > 0, kOp, "exp_avg_sq.sh must have coefficients");
-  BLITZGS_CHECK(extent > 0, kOp, "extent must be positive, got ", extent);
-  BLITZGS_CHECK(level_count > 0, kOp, "level_count must be positive, got ", level_count);
-  const auto rows = checked<std::int64_t>(kOp, "rows", rows_in, {-1});
-  const auto is_split = checked<bool>(kOp, "is_split", is_split_in, {rows.size(0)});
+  const auto grad_sum = checked<float>("grad_sum", columns[0], {n}),
+             opacities = checked<float>("opacities", columns[2], {n}),
+             scales = checked<float>("scales", columns[3], {n, 3}),
+             moments = checked<float>("exp_avg_sq.sh", columns[6], {n, -1, 3});
+  const auto grad_count = checked<std::int32_t>("grad_count", columns[1], {n}),
+             birth = checked<std::int32_t>("birth", columns[4], {n});
+  const auto level = checked<std::uint8_t>("level", columns[5], {n});
+  BLITZGS_CHECK(moments.size(1) > 0, "exp_avg_sq.sh must have coefficients");
+  BLITZGS_CHECK(extent > 0, "extent must be positive, got ", extent);
+  BLITZGS_CHECK(level_count > 0, "level_count must be positive, got ", level_count);
+  const auto rows = checked<std::int64_t>("rows", rows_in, {-1});
+  const auto is_split = checked<bool>("is_split", is_split_in, {rows.size(0)});
   const auto features = make<float>(grad_sum, {rows.size(0), kSpawnFeatures});
-  DeviceScope scope(grad_sum);
   const SpawnFeatures args{grad_sum,     grad_count,
                            opacities,    scales,
                            birth,        level,
@@ -353,21 +316,20 @@ Tensor spawn_features(const std::vector<Tensor>& columns, const Tensor& rows_in,
                            rows.size(0), time,
                            extent,       static_cast<int>(level_count),
                            features};
-  backend::for_each_row(args, scope.stream);
+  run_rows(grad_sum, args);
   return features;
 }
 
 Tensor knn_distances(const Tensor& points, std::int64_t k) {
-  constexpr const char* kOp = "knn_distances";
-  check_floating(kOp, "points", points);
-  check_shape(kOp, "points", points, {-1, 3});
-  BLITZGS_CHECK(k >= 1 && k <= kKnnMaxK, kOp, "k must be in [1, ", kKnnMaxK, "], got ", k);
+  check_floating("points", points);
+  check_shape("points", points, {-1, 3});
+  BLITZGS_CHECK(k >= 1 && k <= kKnnMaxK, "k must be in [1, ", kKnnMaxK, "], got ", k);
   const std::int64_t n = points.size(0);
-  BLITZGS_CHECK(n < (std::int64_t{1} << 31) - kKnnFan, kOp, "at most 2^31 points, got ", n);
+  BLITZGS_CHECK(n < (std::int64_t{1} << 31) - kKnnFan, "at most 2^31 points, got ", n);
   DeviceScope scope(points);
   return dispatch_floating(points, [&]<class T>() -> Tensor {
     const auto distances = make<T>(points, {n, k});
-    backend::knn_distances<T>(checked<T>(kOp, "points", points, {n, 3}), static_cast<std::int32_t>(n),
+    backend::knn_distances<T>(checked<T>("points", points, {n, 3}), static_cast<std::int32_t>(n),
                               static_cast<int>(k), distances, scope.workspace, scope.stream);
     return distances;
   });
@@ -377,22 +339,22 @@ Tensor knn_distances(const Tensor& points, std::int64_t k) {
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) {
-  m.impl("density_stats_", TORCH_BOX(&blitzgs::density_stats_));
-  m.impl("take_rows_", TORCH_BOX(&blitzgs::take_rows_));
-  m.impl("put_rows_", TORCH_BOX(&blitzgs::put_rows_));
-  m.impl("hash_key", TORCH_BOX(&blitzgs::hash_with_key));
-  m.impl("overlap", TORCH_BOX(&blitzgs::overlap));
-  m.impl("draw_weights", TORCH_BOX(&blitzgs::draw_weights));
-  m.impl("residual_draws", TORCH_BOX(&blitzgs::residual_draws));
-  m.impl("share_rows_", TORCH_BOX(&blitzgs::share_rows_));
-  m.impl("bracket_keys", TORCH_BOX(&blitzgs::bracket_keys));
-  m.impl("match_brackets_", TORCH_BOX(&blitzgs::match_brackets_));
-  m.impl("sampling_keys", TORCH_BOX(&blitzgs::sampling_keys));
-  m.impl("key_histogram", TORCH_BOX(&blitzgs::key_histogram));
-  m.impl("find_digit_", TORCH_BOX(&blitzgs::find_digit_));
-  m.impl("keys_up_to", TORCH_BOX(&blitzgs::keys_up_to));
-  m.impl("find_non_finite", TORCH_BOX(&blitzgs::find_non_finite));
-  m.impl("tree_sums", TORCH_BOX(&blitzgs::tree_sums));
-  m.impl("spawn_features", TORCH_BOX(&blitzgs::spawn_features));
-  m.impl("knn_distances", TORCH_BOX(&blitzgs::knn_distances));
+  BLITZGS_OP(m, "density_stats_", density_stats_);
+  BLITZGS_OP(m, "take_rows_", take_rows_);
+  BLITZGS_OP(m, "put_rows_", put_rows_);
+  BLITZGS_OP(m, "hash_key", hash_with_key);
+  BLITZGS_OP(m, "overlap", overlap);
+  BLITZGS_OP(m, "draw_weights", draw_weights);
+  BLITZGS_OP(m, "residual_draws", residual_draws);
+  BLITZGS_OP(m, "share_rows_", share_rows_);
+  BLITZGS_OP(m, "bracket_keys", bracket_keys);
+  BLITZGS_OP(m, "match_brackets_", match_brackets_);
+  BLITZGS_OP(m, "sampling_keys", sampling_keys);
+  BLITZGS_OP(m, "key_histogram", key_histogram);
+  BLITZGS_OP(m, "find_digit_", find_digit_);
+  BLITZGS_OP(m, "keys_up_to", keys_up_to);
+  BLITZGS_OP(m, "find_non_finite", find_non_finite);
+  BLITZGS_OP(m, "tree_sums", tree_sums);
+  BLITZGS_OP(m, "spawn_features", spawn_features);
+  BLITZGS_OP(m, "knn_distances", knn_distances);
 }

@@ -11,31 +11,9 @@
 namespace blitzgs {
 namespace {
 
-// The candidates of a projection: ids, the views that may see each, the number of valid ids, and the number
-// of blocks of the table to which they belong. Without ids, all Gaussians in all views are candidates.
-struct Candidates {
-  OptionalValues<const std::int32_t> ids, views, blocks;
-  OptionalTensor listed;
-  std::int64_t count;
-
-  Candidates(const char* op, const OptionalTensor& active_ids, const OptionalTensor& active_views,
-             const OptionalTensor& n_active, const OptionalTensor& n_blocks, std::int64_t n_gaussians)
-      : count(n_gaussians) {
-    BLITZGS_CHECK(active_ids || (!active_views && !n_active && !n_blocks), op,
-                  "active_views, n_active and n_blocks need active_ids");
-    if (!active_ids) return;
-    ids = checked<std::int32_t>(op, "active_ids", active_ids, {-1});
-    const std::int64_t length = ids->numel();
-    views = checked<std::int32_t>(op, "active_views", active_views, {length});
-    listed = n_active;
-    blocks = checked<std::int32_t>(op, "n_blocks", n_blocks, {1});
-    count = max_listed(op, listed, length);
-  }
-};
-
-RankTiles checked_rank_tiles(const char* op, const IntList& begins_and_ends) {
+RankTiles checked_rank_tiles(const IntList& begins_and_ends) {
   const std::size_t n_ranks = begins_and_ends.size() / 2;
-  BLITZGS_CHECK(begins_and_ends.size() == 2 * n_ranks && n_ranks <= kMaxRanks, op,
+  BLITZGS_CHECK(begins_and_ends.size() == 2 * n_ranks && n_ranks <= kMaxRanks,
                 "rank_tiles must have a begin and an end for each of at most ", kMaxRanks, " ranks, got ",
                 begins_and_ends.size(), " numbers");
   RankTiles ranks{};
@@ -47,50 +25,54 @@ RankTiles checked_rank_tiles(const char* op, const IntList& begins_and_ends) {
   return ranks;
 }
 
-std::optional<ProjectSizes> checked_capacity(const char* op, std::optional<std::int64_t> visible,
+std::optional<ProjectSizes> checked_capacity(std::optional<std::int64_t> visible,
                                              std::optional<std::int64_t> splats) {
   BLITZGS_CHECK(
-      visible.has_value() == splats.has_value() && visible.value_or(1) > 0 && splats.value_or(1) > 0, op,
+      visible.has_value() == splats.has_value() && visible.value_or(1) > 0 && splats.value_or(1) > 0,
       "capacity must be how many visible Gaussians and splats there is room for, at least 1 each");
   if (!visible) return std::nullopt;
   return ProjectSizes{*visible, *splats};
 }
 
 // The columns of the splats, in the order in which the op returns them, and the totals.
-using Projected = decltype(std::tuple_cat(std::array<Tensor, 13>(), std::tuple<Tensor>()));
-
-Projected project_fwd(const TensorList& gaussians, const Tensor& viewmats, const Tensor& Ks,
-                      const OptionalTensor& active_ids, const OptionalTensor& active_views,
-                      const OptionalTensor& n_active, const OptionalTensor& n_blocks,
-                      const OptionalTensor& ids, const OptionalTensor& level, BLITZGS_PROJECT_OPTIONS,
-                      const FloatList& fade, const IntList& rank_tiles,
-                      std::optional<std::int64_t> visible_capacity,
-                      std::optional<std::int64_t> splat_capacity) {
-  constexpr const char* kOp = "project_fwd";
-  const ProjectArguments p(kOp, gaussians, viewmats, Ks,
-                           checked_options(kOp, BLITZGS_PROJECT_OPTION_NAMES, fade), fade, level);
-  const Candidates candidates(kOp, active_ids, active_views, n_active, n_blocks, p.count);
-  const RankTiles ranks = checked_rank_tiles(kOp, rank_tiles);
-  const std::optional<ProjectSizes> sizes = checked_capacity(kOp, visible_capacity, splat_capacity);
-  const auto persistent = checked<std::int64_t>(kOp, "ids", ids, {p.count});
+Tensors<14> project_fwd(const TensorList& gaussians, const Tensor& viewmats, const Tensor& Ks,
+                        const OptionalTensor& active_ids, const OptionalTensor& active_views,
+                        const OptionalTensor& n_active, const OptionalTensor& n_blocks,
+                        const OptionalTensor& ids, const OptionalTensor& level, BLITZGS_PROJECT_OPTIONS,
+                        const FloatList& fade, const IntList& rank_tiles,
+                        std::optional<std::int64_t> visible_capacity,
+                        std::optional<std::int64_t> splat_capacity) {
+  const ProjectArguments p(gaussians, viewmats, Ks, checked_options(BLITZGS_PROJECT_OPTION_NAMES, fade), fade,
+                           level);
+  // Without active_ids, all Gaussians in all views are candidates.
+  BLITZGS_CHECK(active_ids || (!active_views && !n_active && !n_blocks),
+                "active_views, n_active and n_blocks need active_ids");
+  const auto candidates = checked<std::int32_t>("active_ids", active_ids, {-1});
+  const std::int64_t length = candidates ? candidates->numel() : p.count;
+  const auto candidate_views = checked<std::int32_t>("active_views", active_views, {length}),
+             blocks = checked<std::int32_t>("n_blocks", n_blocks, {1});
+  const std::int64_t listed = max_listed(n_active, length);
+  const RankTiles ranks = checked_rank_tiles(rank_tiles);
+  const std::optional<ProjectSizes> sizes = checked_capacity(visible_capacity, splat_capacity);
+  const auto persistent = checked<std::int64_t>("ids", ids, {p.count});
   const auto totals = make<std::int64_t>(p.means, {project_totals(p.n_views, ranks.n_ranks)});
   std::array<Tensor, 13> columns;
   DeviceScope scope(p.means);
   dispatch_floating(p.means, [&]<class T>() {
     ProjectInputs<T> in = p.inputs<T>();
-    in.active_ids = candidates.ids;
-    in.active_views = candidates.views;
-    in.n_candidates = candidates.count;
-    in.n_active = data_or_null<std::int32_t>(candidates.listed);
-    in.n_blocks = candidates.blocks;
+    in.active_ids = candidates;
+    in.active_views = candidate_views;
+    in.n_candidates = listed;
+    in.n_active = data_or_null<std::int32_t>(n_active);
+    in.n_blocks = blocks;
     const auto memory = [&](const ProjectSizes& needed) -> ProjectColumns<T> {
       const std::int64_t U = needed.visible, P = needed.splats;
       BLITZGS_CHECK(
-          P <= std::numeric_limits<std::int32_t>::max(), kOp, "", P,
+          P <= INT32_MAX, P,
           " splats (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
       const bool with_masks = ranks.n_ranks > 0, with_ids = persistent.has_value();
       auto next = columns.begin();
-      const auto add = [&](auto zero, const std::vector<std::int64_t>& shape) {
+      const auto add = [&](auto zero, const IntList& shape) {
         const auto values = make<decltype(zero)>(p.means, shape);
         *next++ = values;
         return values;
@@ -110,90 +92,77 @@ Projected project_fwd(const TensorList& gaussians, const Tensor& viewmats, const
   return std::tuple_cat(columns, std::tuple<Tensor>(totals));
 }
 
-class HeldSplatGradients {
- public:
-  // splats: P.
-  HeldSplatGradients(const char* op, ScalarType dtype, std::int64_t splats,
-                     const std::vector<Tensor>& v_splats, const std::optional<Tensor>& v_depths)
-      : held_(v_splats), depths_(v_depths), in_table_(v_splats.size() == 1) {
-#ifndef BLITZGS_BACKEND_CUDA
-    BLITZGS_CHECK(!in_table_, op, "a table of gradients needs CUDA; give columns");
-#endif
-    if (in_table_) {
-      BLITZGS_CHECK(!v_depths, op, "v_depths needs gradients in columns");
-      check_in_place(op, "v_splats[0]", held_[0], ScalarType::Float, {splats, kSplatGradient});
-      BLITZGS_CHECK(reinterpret_cast<std::uintptr_t>(held_[0].const_data_ptr()) % alignof(SplatGradient) == 0,
-                    op, "the table of v_splats must begin at a multiple of 16 bytes");
+// The outputs of the forward pass that both ops read, the weights of the regularisers for each view, and the
+// gradients of the splats. The object holds the tensors, so that the raw pointers stay valid.
+struct BackwardInputs {
+  Values<const std::int32_t> camera_ids, visible_ids, splat_offsets;
+  OptionalTensor scale_reg, opacity_reg, v_depths;
+  TensorList v_splats;
+
+  BackwardInputs(const ProjectArguments& p, const Tensor& camera_ids_in, const Tensor& visible_ids_in,
+                 const Tensor& splat_offsets_in, const OptionalTensor& scale_reg_in,
+                 const OptionalTensor& opacity_reg_in, const TensorList& v_splats_in,
+                 const OptionalTensor& v_depths_in = std::nullopt)
+      : camera_ids(checked<std::int32_t>("camera_ids", camera_ids_in, {-1})),
+        visible_ids(checked<std::int32_t>("visible_ids", visible_ids_in, {-1})),
+        splat_offsets(checked<std::int32_t>("splat_offsets", splat_offsets_in, {visible() + 1})),
+        v_splats(v_splats_in) {
+    const ScalarType dtype = p.means.scalar_type();
+    scale_reg = checked("scale_reg", scale_reg_in, dtype, {p.n_views});
+    opacity_reg = checked("opacity_reg", opacity_reg_in, dtype, {p.n_views});
+    const std::int64_t splats = camera_ids.numel();
+    BLITZGS_CHECK(kOnCuda || !in_table(), "a table of gradients needs CUDA; give columns");
+    if (in_table()) {
+      BLITZGS_CHECK(!v_depths_in, "v_depths needs gradients in columns");
+      check_in_place("v_splats[0]", v_splats[0], ScalarType::Float, {splats, kSplatGradient});
+      BLITZGS_CHECK(
+          reinterpret_cast<std::uintptr_t>(v_splats[0].const_data_ptr()) % alignof(SplatGradient) == 0,
+          "the table of v_splats must begin at a multiple of 16 bytes");
       return;
     }
-    BLITZGS_CHECK(v_splats.size() == 3 || v_splats.size() == 4, op,
+    BLITZGS_CHECK(v_splats.size() == 3 || v_splats.size() == 4,
                   "v_splats must be v_means2d, v_conics, v_opacities[, v_colors] or one table, got ",
                   v_splats.size(), " tensors");
-    held_[0] = checked(op, "v_means2d", held_[0], dtype, {splats, 2});
-    held_[1] = checked(op, "v_conics", held_[1], dtype, {splats, 3});
-    held_[2] = checked(op, "v_opacities", held_[2], dtype, {splats});
-    if (held_.size() == 4) held_[3] = checked(op, "v_colors", held_[3], dtype, {splats, 3});
-    depths_ = checked(op, "v_depths", depths_, dtype, {splats});
+    v_splats[0] = checked("v_means2d", v_splats[0], dtype, {splats, 2});
+    v_splats[1] = checked("v_conics", v_splats[1], dtype, {splats, 3});
+    v_splats[2] = checked("v_opacities", v_splats[2], dtype, {splats});
+    if (v_splats.size() == 4) v_splats[3] = checked("v_colors", v_splats[3], dtype, {splats, 3});
+    v_depths = checked("v_depths", v_depths_in, dtype, {splats});
   }
 
-  // The source that the kernels read. It points to tensors that this object holds.
-  template <class T>
-  SplatGradientSource<T> source() const {
-#ifdef BLITZGS_BACKEND_CUDA
-    if (in_table_) return PackedSplatGradients{reinterpret_cast<const SplatGradient*>(data<float>(held_[0]))};
-#endif
-    return SplatGradientColumns<T>{data<T>(held_[0]), data<T>(held_[1]), data_or_null<T>(depths_),
-                                   data<T>(held_[2]), held_.size() == 4 ? data<T>(held_[3]) : nullptr};
-  }
-
- private:
-  std::vector<Tensor> held_;
-  std::optional<Tensor> depths_;
-  bool in_table_;
-};
-
-// The outputs of the forward pass that both ops read, and the weights of the regularisers for each view. The
-// object holds the tensors, so that the raw pointers stay valid.
-struct BackwardSplats {
-  Values<const std::int32_t> camera_ids, visible_ids, splat_offsets;
-  OptionalTensor scale_reg, opacity_reg;
-
-  BackwardSplats(const char* op, const ProjectArguments& p, const Tensor& camera_ids_in,
-                 const Tensor& visible_ids_in, const Tensor& splat_offsets_in,
-                 const OptionalTensor& scale_reg_in, const OptionalTensor& opacity_reg_in)
-      : camera_ids(checked<std::int32_t>(op, "camera_ids", camera_ids_in, {-1})),
-        visible_ids(checked<std::int32_t>(op, "visible_ids", visible_ids_in, {-1})),
-        splat_offsets(checked<std::int32_t>(op, "splat_offsets", splat_offsets_in, {visible() + 1})) {
-    const ScalarType dtype = p.means.scalar_type();
-    scale_reg = checked(op, "scale_reg", scale_reg_in, dtype, {p.n_views});
-    opacity_reg = checked(op, "opacity_reg", opacity_reg_in, dtype, {p.n_views});
-  }
-
+  bool in_table() const { return v_splats.size() == 1; }
   std::int64_t visible() const { return visible_ids.numel(); }
-  std::int64_t count() const { return camera_ids.numel(); }
   SplatIndex pointers() const { return {camera_ids, visible_ids, splat_offsets, visible()}; }
   template <class T>
   Regularisers<T> regularisers() const {
     return {data_or_null<T>(scale_reg), data_or_null<T>(opacity_reg)};
   }
+  // Where the kernels read the gradients of the splats.
+  template <class T>
+  SplatGradientSource<T> gradients() const {
+#ifdef BLITZGS_BACKEND_CUDA
+    if (in_table())
+      return PackedSplatGradients{reinterpret_cast<const SplatGradient*>(data<float>(v_splats[0]))};
+#endif
+    return SplatGradientColumns<T>{data<T>(v_splats[0]), data<T>(v_splats[1]), data_or_null<T>(v_depths),
+                                   data<T>(v_splats[2]),
+                                   v_splats.size() == 4 ? data<T>(v_splats[3]) : nullptr};
+  }
 };
 
-using BackwardTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
-
-BackwardTensors project_bwd(const TensorList& gaussians, const Tensor& viewmats, const Tensor& Ks,
-                            const OptionalTensor& scale_reg, const OptionalTensor& opacity_reg,
-                            const Tensor& camera_ids, const Tensor& visible_ids, const Tensor& splat_offsets,
-                            const OptionalTensor& level, BLITZGS_PROJECT_OPTIONS, const FloatList& fade,
-                            const TensorList& v_splats, const OptionalTensor& v_depths, bool need_viewmats,
-                            bool dense) {
-  constexpr const char* kOp = "project_bwd";
-  const ProjectArguments p(kOp, gaussians, viewmats, Ks,
-                           checked_options(kOp, BLITZGS_PROJECT_OPTION_NAMES, fade), fade, level);
-  const BackwardSplats b(kOp, p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg);
-  const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, v_depths);
+Tensors<6> project_bwd(const TensorList& gaussians, const Tensor& viewmats, const Tensor& Ks,
+                       const OptionalTensor& scale_reg, const OptionalTensor& opacity_reg,
+                       const Tensor& camera_ids, const Tensor& visible_ids, const Tensor& splat_offsets,
+                       const OptionalTensor& level, BLITZGS_PROJECT_OPTIONS, const FloatList& fade,
+                       const TensorList& v_splats, const OptionalTensor& v_depths, bool need_viewmats,
+                       bool dense) {
+  const ProjectArguments p(gaussians, viewmats, Ks, checked_options(BLITZGS_PROJECT_OPTION_NAMES, fade), fade,
+                           level);
+  const BackwardInputs b(p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg, v_splats,
+                         v_depths);
   const std::int64_t length = dense ? p.count : b.visible();
   DeviceScope scope(p.means);
-  return dispatch_floating(p.means, [&]<class T>() -> BackwardTensors {
+  return dispatch_floating(p.means, [&]<class T>() -> Tensors<6> {
     const auto v_means = make<T>(p.means, {length, 3}), v_quats = make<T>(p.means, {length, 4}),
                v_scales = make<T>(p.means, {length, 3}), v_opacities = make<T>(p.means, {length}),
                v_sh = make<T>(p.means, {length, p.sh_stride, 3}),
@@ -205,7 +174,7 @@ BackwardTensors project_bwd(const TensorList& gaussians, const Tensor& viewmats,
           scope.stream);
     }
     backend::project_bwd(
-        p.inputs<T>(), b.pointers(), v.source<T>(), b.regularisers<T>(),
+        p.inputs<T>(), b.pointers(), b.gradients<T>(), b.regularisers<T>(),
         ProjectGradients<T>{v_means, v_quats, v_scales, v_opacities, v_sh.data_if(p.sh.has_value()),
                             v_viewmats.data_if(need_viewmats), dense},
         scope.workspace, scope.stream);
@@ -219,17 +188,15 @@ void project_bwd_step(const TensorList& state_in, const TensorList& tables, std:
                       const OptionalTensor& opacity_reg, const Tensor& camera_ids, const Tensor& visible_ids,
                       const Tensor& splat_offsets, const OptionalTensor& level, BLITZGS_PROJECT_OPTIONS,
                       const FloatList& fade, const TensorList& v_splats) {
-  constexpr const char* kOp = "project_bwd_step_";
-  AdamTensors state(kOp, state_in, tables, {step, explicit_steps, beta1, beta2, eps});
+  AdamTensors state(state_in, tables, {step, explicit_steps, beta1, beta2, eps});
   state.check_takes_step();
-  const ProjectArguments p(kOp, state.params, viewmats, Ks,
-                           checked_options(kOp, BLITZGS_PROJECT_OPTION_NAMES, fade), fade, level);
-  const BackwardSplats b(kOp, p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg);
-  const HeldSplatGradients v(kOp, p.means.scalar_type(), b.count(), v_splats, std::nullopt);
+  const ProjectArguments p(state.params, viewmats, Ks, checked_options(BLITZGS_PROJECT_OPTION_NAMES, fade),
+                           fade, level);
+  const BackwardInputs b(p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg, v_splats);
   if (b.visible() == 0) return;
   DeviceScope scope(p.means);
   dispatch_floating(p.means, [&]<class T>() {
-    backend::project_bwd_step(p.inputs<T>(), b.pointers(), v.source<T>(), b.regularisers<T>(),
+    backend::project_bwd_step(p.inputs<T>(), b.pointers(), b.gradients<T>(), b.regularisers<T>(),
                               state.arguments<T>(b.visible_ids), scope.workspace, scope.stream);
   });
 }
@@ -238,7 +205,7 @@ void project_bwd_step(const TensorList& state_in, const TensorList& tables, std:
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) {
-  m.impl("project_fwd", TORCH_BOX(&blitzgs::project_fwd));
-  m.impl("project_bwd", TORCH_BOX(&blitzgs::project_bwd));
-  m.impl("project_bwd_step_", TORCH_BOX(&blitzgs::project_bwd_step));
+  BLITZGS_OP(m, "project_fwd", project_fwd);
+  BLITZGS_OP(m, "project_bwd", project_bwd);
+  BLITZGS_OP(m, "project_bwd_step_", project_bwd_step);
 }

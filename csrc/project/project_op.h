@@ -9,18 +9,6 @@
 
 namespace blitzgs {
 
-using OptionalTensor = std::optional<Tensor>;
-using TensorList = std::vector<Tensor>;
-using IntList = std::vector<std::int64_t>;
-using FloatList = std::vector<double>;
-
-// Checks the number of entries of a group of arguments. names: those of the entries, for the message.
-template <class List>
-void check_group(const char* op, const char* names, const List& list, std::size_t least, std::size_t most) {
-  BLITZGS_CHECK(list.size() >= least && list.size() <= most, op, "expected ", names, ", got ", list.size(),
-                " entries");
-}
-
 // The options of the projection as the ops take them, and as arguments of checked_options.
 #define BLITZGS_PROJECT_OPTIONS                                                            \
   std::int64_t width, std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree, \
@@ -29,19 +17,17 @@ void check_group(const char* op, const char* names, const List& list, std::size_
   width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw
 
 // fade: empty, or the floats of set_fade.
-inline ProjectOptions<double> checked_options(const char* op, BLITZGS_PROJECT_OPTIONS,
-                                              const FloatList& fade) {
-  BLITZGS_CHECK(width > 0 && height > 0 && width < (1 << 24) && height < (1 << 24), op,
+inline ProjectOptions<double> checked_options(BLITZGS_PROJECT_OPTIONS, const FloatList& fade) {
+  BLITZGS_CHECK(width > 0 && height > 0 && width < (1 << 24) && height < (1 << 24),
                 "width and height must be in [1, 2^24), got ", width, " x ", height);
-  BLITZGS_CHECK(tile_size > 0 && tile_size < (1 << 24), op, "tile_size must be in [1, 2^24), got ",
-                tile_size);
+  BLITZGS_CHECK(tile_size > 0 && tile_size < (1 << 24), "tile_size must be in [1, 2^24), got ", tile_size);
   // NaN fails each of these comparisons.
-  BLITZGS_CHECK(near_plane < far_plane, op, "near_plane must be less than far_plane, got ", near_plane,
-                " and ", far_plane);
-  BLITZGS_CHECK(eps2d >= 0 && eps2d <= FLT_MAX && radius_clip >= 0, op,
+  BLITZGS_CHECK(near_plane < far_plane, "near_plane must be less than far_plane, got ", near_plane, " and ",
+                far_plane);
+  BLITZGS_CHECK(eps2d >= 0 && eps2d <= FLT_MAX && radius_clip >= 0,
                 "eps2d must be finite, and eps2d and radius_clip at least 0, got ", eps2d, " and ",
                 radius_clip);
-  check_group(op, "(fade_slope, reach of each level)", fade, 0, 1 + kMaxLevels);
+  check_group("(fade_slope, reach of each level)", fade, 0, 1 + kMaxLevels);
   return {static_cast<int>(width),
           static_cast<int>(height),
           static_cast<int>(tile_size),
@@ -58,8 +44,8 @@ inline ProjectOptions<double> checked_options(const char* op, BLITZGS_PROJECT_OP
 
 // Sets the parameters of smooth levels. The numbers are f / (f - 1), then for each level the distance from
 // which on its weight is 0 (infinite: the level never fades; negative: its weight is 0 everywhere).
-inline void set_fade(const char* op, const Tensor& level, const FloatList& numbers, LevelFade& fade) {
-  BLITZGS_CHECK(numbers.size() > 1 && numbers[0] >= 1, op,
+inline void set_fade(const Tensor& level, const FloatList& numbers, LevelFade& fade) {
+  BLITZGS_CHECK(numbers.size() > 1 && numbers[0] >= 1,
                 "levels need a fade_slope of at least 1 and a reach for each level in fade, got ",
                 numbers.size(), " floats");
   fade.level = data<std::uint8_t>(level);
@@ -80,28 +66,27 @@ struct ProjectArguments {
   LevelFade fade{};
 
   // level_in: the octree levels of the Gaussians, with smooth levels, whose numbers are in `numbers`.
-  ProjectArguments(const char* op, const TensorList& gaussians, const Tensor& viewmats_in,
-                   const Tensor& Ks_in, const ProjectOptions<double>& options_in,
-                   const FloatList& numbers = {}, const OptionalTensor& level_in = std::nullopt)
+  ProjectArguments(const TensorList& gaussians, const Tensor& viewmats_in, const Tensor& Ks_in,
+                   const ProjectOptions<double>& options_in, const FloatList& numbers = {},
+                   const OptionalTensor& level_in = std::nullopt)
       : options(options_in) {
-    check_group(op, "(means, quats, scales, opacities[, sh])", gaussians, 4, 5);
-    check_floating(op, "means", gaussians[0]);
+    check_group("(means, quats, scales, opacities[, sh])", gaussians, 4, 5);
+    check_floating("means", gaussians[0]);
     const ScalarType dtype = gaussians[0].scalar_type();
-    means = checked(op, "means", gaussians[0], dtype, {-1, 3});
+    means = checked("means", gaussians[0], dtype, {-1, 3});
     count = means.size(0);
-    quats = checked(op, "quats", gaussians[1], dtype, {count, 4});
-    scales = checked(op, "scales", gaussians[2], dtype, {count, 3});
-    opacities = checked(op, "opacities", gaussians[3], dtype, {count});
-    viewmats = checked(op, "viewmats", viewmats_in, dtype, {-1, 4, 4});
+    quats = checked("quats", gaussians[1], dtype, {count, 4});
+    scales = checked("scales", gaussians[2], dtype, {count, 3});
+    opacities = checked("opacities", gaussians[3], dtype, {count});
+    viewmats = checked("viewmats", viewmats_in, dtype, {-1, 4, 4});
     n_views = viewmats.size(0);
-    Ks = checked(op, "Ks", Ks_in, dtype, {n_views, 3, 3});
-    BLITZGS_CHECK(n_views <= kMaxViews, op, "at most ", kMaxViews, " views in one launch, got ", n_views,
+    Ks = checked("Ks", Ks_in, dtype, {n_views, 3, 3});
+    BLITZGS_CHECK(n_views <= kMaxViews, "at most ", kMaxViews, " views in one launch, got ", n_views,
                   "; call it for fewer views at a time");
-    BLITZGS_CHECK(count <= std::numeric_limits<std::int32_t>::max(), op,
-                  "at most 2^31 - 1 Gaussians on one device, got ", count);
-    if (gaussians.size() == 5) set_sh(op, gaussians[4]);
-    level = checked(op, "level", level_in, ScalarType::Byte, {count});
-    if (level) set_fade(op, *level, numbers, fade);
+    BLITZGS_CHECK(count <= INT32_MAX, "at most 2^31 - 1 Gaussians on one device, got ", count);
+    if (gaussians.size() == 5) set_sh(gaussians[4]);
+    level = checked("level", level_in, ScalarType::Byte, {count});
+    if (level) set_fade(*level, numbers, fade);
   }
 
   template <class T>
@@ -126,13 +111,13 @@ struct ProjectArguments {
   }
 
  private:
-  void set_sh(const char* op, const Tensor& sh_in) {
-    sh = checked(op, "sh", sh_in, means.scalar_type(), {count, -1, 3});
+  void set_sh(const Tensor& sh_in) {
+    sh = checked("sh", sh_in, means.scalar_type(), {count, -1, 3});
     sh_stride = sh->size(1);
     options.sh_stride = static_cast<int>(sh_stride);
-    BLITZGS_CHECK(options.sh_degree >= 0 && options.sh_degree <= kMaxShDegree, op,
+    BLITZGS_CHECK(options.sh_degree >= 0 && options.sh_degree <= kMaxShDegree,
                   "sh_degree must be 0 to 3, got ", options.sh_degree);
-    BLITZGS_CHECK(sh_basis_count(options.sh_degree) <= sh_stride, op, "sh has ", sh_stride,
+    BLITZGS_CHECK(sh_basis_count(options.sh_degree) <= sh_stride, "sh has ", sh_stride,
                   " coefficients, sh_degree ", options.sh_degree, " needs ",
                   sh_basis_count(options.sh_degree));
   }

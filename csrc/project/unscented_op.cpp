@@ -2,10 +2,8 @@
 #include "project/unscented.h"
 
 #include <cmath>
-#include <tuple>
 
 #include "common/op.h"
-#include "common/rows.h"
 #include "project/project_op.h"
 
 namespace blitzgs {
@@ -19,21 +17,21 @@ struct UnscentedArguments {
   UnscentedOptions options;
 
   // transform: alpha, beta, kappa, margin, and whether all points have to be valid.
-  UnscentedArguments(const char* op, const TensorList& gaussians, const Tensor& viewmats, const Tensor& Ks,
+  UnscentedArguments(const TensorList& gaussians, const Tensor& viewmats, const Tensor& Ks,
                      const Tensor& lenses_in, const OptionalTensor& viewmats_rs_in, bool fisheye,
                      std::int64_t shutter, const FloatList& transform, const ProjectOptions<double>& image)
-      : p(op, gaussians, viewmats, Ks, image) {
+      : p(gaussians, viewmats, Ks, image) {
     const ScalarType dtype = p.means.scalar_type();
-    lenses = checked(op, "lenses", lenses_in, dtype, {p.n_views, kLensNumbers});
-    viewmats_rs = checked(op, "viewmats_rs", viewmats_rs_in, dtype, {p.n_views, 4, 4});
-    BLITZGS_CHECK(shutter >= 0 && shutter <= static_cast<int>(Shutter::kGlobal), op,
+    lenses = checked("lenses", lenses_in, dtype, {p.n_views, kLensNumbers});
+    viewmats_rs = checked("viewmats_rs", viewmats_rs_in, dtype, {p.n_views, 4, 4});
+    BLITZGS_CHECK(shutter >= 0 && shutter <= static_cast<int>(Shutter::kGlobal),
                   "shutter must be 0 to 4, got ", shutter);
     options.shutter = static_cast<Shutter>(shutter);
-    BLITZGS_CHECK(viewmats_rs.has_value() == (options.shutter != Shutter::kGlobal), op,
+    BLITZGS_CHECK(viewmats_rs.has_value() == (options.shutter != Shutter::kGlobal),
                   "a rolling shutter needs viewmats_rs, and a global one (4) none");
-    check_group(op, "(alpha, beta, kappa, margin, all_valid)", transform, 5, 5);
+    check_group("(alpha, beta, kappa, margin, all_valid)", transform, 5, 5);
     const double alpha2 = transform[0] * transform[0], n = alpha2 * (3 + transform[2]);
-    BLITZGS_CHECK(n > 0 && std::isfinite(n), op, "alpha^2 (3 + kappa) must be positive, got ", n);
+    BLITZGS_CHECK(n > 0 && std::isfinite(n), "alpha^2 (3 + kappa) must be positive, got ", n);
     options.fisheye = fisheye;
     options.margin = transform[3];
     options.all_valid = transform[4] != 0;
@@ -52,70 +50,59 @@ struct UnscentedArguments {
   const TensorList &gaussians, const Tensor &viewmats, const Tensor &Ks, const Tensor &lenses,           \
       const OptionalTensor &viewmats_rs, bool fisheye, std::int64_t shutter, const FloatList &transform, \
       BLITZGS_PROJECT_OPTIONS
-#define BLITZGS_UNSCENTED_CHECKED(op)                                            \
-  op, gaussians, viewmats, Ks, lenses, viewmats_rs, fisheye, shutter, transform, \
-      checked_options(op, BLITZGS_PROJECT_OPTION_NAMES, {})
+#define BLITZGS_UNSCENTED_CHECKED                                            \
+  gaussians, viewmats, Ks, lenses, viewmats_rs, fisheye, shutter, transform, \
+      checked_options(BLITZGS_PROJECT_OPTION_NAMES, {})
 
 Tensor unscented_visible(BLITZGS_UNSCENTED) {
-  const UnscentedArguments a(BLITZGS_UNSCENTED_CHECKED("unscented_visible"));
+  const UnscentedArguments a(BLITZGS_UNSCENTED_CHECKED);
   const std::int64_t rows = a.p.count * a.p.n_views;
   const auto seen = make<bool>(a.p.means, {a.p.count, a.p.n_views});
-  DeviceScope scope(a.p.means);
-  dispatch_floating(a.p.means, [&]<class T>() {
-    backend::for_each_row(UnscentedVisible<T>{a.inputs<T>(), seen, rows}, scope.stream);
-  });
+  dispatch_floating(a.p.means,
+                    [&]<class T>() { run_rows(a.p.means, UnscentedVisible<T>{a.inputs<T>(), seen, rows}); });
   return seen;
 }
 
-using SplatValuesTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
-
-SplatValuesTensors unscented_fwd(BLITZGS_UNSCENTED, const Tensor& gaussian_ids_in,
-                                 const Tensor& camera_ids_in, const Tensor&) {
-  constexpr const char* kOp = "unscented_fwd";
-  const UnscentedArguments a(BLITZGS_UNSCENTED_CHECKED(kOp));
-  const auto gaussian_ids = checked<std::int32_t>(kOp, "gaussian_ids", gaussian_ids_in, {-1});
+Tensors<7> unscented_fwd(BLITZGS_UNSCENTED, const Tensor& gaussian_ids_in, const Tensor& camera_ids_in,
+                         const Tensor&) {
+  const UnscentedArguments a(BLITZGS_UNSCENTED_CHECKED);
+  const auto gaussian_ids = checked<std::int32_t>("gaussian_ids", gaussian_ids_in, {-1});
   const std::int64_t P = gaussian_ids.numel();
-  const auto camera_ids = checked<std::int32_t>(kOp, "camera_ids", camera_ids_in, {P});
+  const auto camera_ids = checked<std::int32_t>("camera_ids", camera_ids_in, {P});
   const Tensor& like = a.p.means;
   const auto radii = make<std::int32_t>(like, {P, 2}), tiles = make<std::int32_t>(like, {P});
-  DeviceScope scope(like);
-  return dispatch_floating(like, [&]<class T>() -> SplatValuesTensors {
+  return dispatch_floating(like, [&]<class T>() -> Tensors<7> {
     const auto means2d = make<T>(like, {P, 2}), conics = make<T>(like, {P, 3}), depths = make<T>(like, {P}),
                opacities = make<T>(like, {P}), colors = make<T>(like, {a.p.sh ? P : 0, 3});
     const ProjectOutputs<T> out{means2d, conics, depths,  opacities, colors,
                                 radii,   tiles,  nullptr, nullptr,   nullptr};
-    backend::for_each_row(UnscentedSplats<T>{a.inputs<T>(), gaussian_ids, camera_ids, out, P}, scope.stream);
+    run_rows(like, UnscentedSplats<T>{a.inputs<T>(), gaussian_ids, camera_ids, out, P});
     return {means2d, conics, depths, opacities, colors, radii, tiles};
   });
 }
 
-using Gradients = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
-
 // v_splats: the gradients of means2d, conics, depths, opacities[, colors].
-Gradients unscented_bwd(BLITZGS_UNSCENTED, const Tensor& camera_ids_in, const Tensor& offsets_in,
-                        const TensorList& v_splats) {
-  constexpr const char* kOp = "unscented_bwd";
-  const UnscentedArguments a(BLITZGS_UNSCENTED_CHECKED(kOp));
+Tensors<5> unscented_bwd(BLITZGS_UNSCENTED, const Tensor& camera_ids_in, const Tensor& offsets_in,
+                         const TensorList& v_splats) {
+  const UnscentedArguments a(BLITZGS_UNSCENTED_CHECKED);
   const std::int64_t N = a.p.count;
-  const auto camera_ids = checked<std::int32_t>(kOp, "camera_ids", camera_ids_in, {-1}),
-             offsets = checked<std::int32_t>(kOp, "splat_offsets", offsets_in, {N + 1});
+  const auto camera_ids = checked<std::int32_t>("camera_ids", camera_ids_in, {-1}),
+             offsets = checked<std::int32_t>("splat_offsets", offsets_in, {N + 1});
   const std::int64_t P = camera_ids.numel();
   const Tensor& like = a.p.means;
   const std::size_t columns = a.p.sh ? 5 : 4;
-  check_group(kOp, "(v_means2d, v_conics, v_depths, v_opacities[, v_colors])", v_splats, columns, columns);
-  DeviceScope scope(like);
-  return dispatch_floating(like, [&]<class T>() -> Gradients {
-    const auto v_means2d = checked<T>(kOp, "v_means2d", v_splats[0], {P, 2}),
-               v_conics = checked<T>(kOp, "v_conics", v_splats[1], {P, 3}),
-               v_depths = checked<T>(kOp, "v_depths", v_splats[2], {P}),
-               v_opacities = checked<T>(kOp, "v_opacities", v_splats[3], {P});
-    const auto v_colors =
-        checked<T>(kOp, "v_colors", a.p.sh ? OptionalTensor(v_splats[4]) : std::nullopt, {P, 3});
+  check_group("(v_means2d, v_conics, v_depths, v_opacities[, v_colors])", v_splats, columns, columns);
+  return dispatch_floating(like, [&]<class T>() -> Tensors<5> {
+    const auto v_means2d = checked<T>("v_means2d", v_splats[0], {P, 2}),
+               v_conics = checked<T>("v_conics", v_splats[1], {P, 3}),
+               v_depths = checked<T>("v_depths", v_splats[2], {P}),
+               v_opacities = checked<T>("v_opacities", v_splats[3], {P});
+    const auto v_colors = checked<T>("v_colors", a.p.sh ? OptionalTensor(v_splats[4]) : std::nullopt, {P, 3});
     const auto means = make<T>(like, {N, 3}), quats = make<T>(like, {N, 4}), scales = make<T>(like, {N, 3}),
                opacities = make<T>(like, {N}), sh = make<T>(like, {N, a.p.sh_stride, 3});
     const SplatGradientColumns<T> v{v_means2d, v_conics, v_depths, v_opacities, v_colors};
     const ProjectGradients<T> out{means, quats, scales, opacities, sh, nullptr};
-    backend::for_each_row(UnscentedGradients<T>{a.inputs<T>(), camera_ids, offsets, v, out, N}, scope.stream);
+    run_rows(like, UnscentedGradients<T>{a.inputs<T>(), camera_ids, offsets, v, out, N});
     return {means, quats, scales, opacities, sh};
   });
 }
@@ -124,7 +111,7 @@ Gradients unscented_bwd(BLITZGS_UNSCENTED, const Tensor& camera_ids_in, const Te
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) {
-  m.impl("unscented_visible", TORCH_BOX(&blitzgs::unscented_visible));
-  m.impl("unscented_fwd", TORCH_BOX(&blitzgs::unscented_fwd));
-  m.impl("unscented_bwd", TORCH_BOX(&blitzgs::unscented_bwd));
+  BLITZGS_OP(m, "unscented_visible", unscented_visible);
+  BLITZGS_OP(m, "unscented_fwd", unscented_fwd);
+  BLITZGS_OP(m, "unscented_bwd", unscented_bwd);
 }

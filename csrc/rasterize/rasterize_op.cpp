@@ -6,18 +6,8 @@
 namespace blitzgs {
 namespace {
 
-// Whether the backend has the packed table of splat gradients.
-#ifdef BLITZGS_BACKEND_CUDA
-constexpr bool kPacked = true;
-#else
-constexpr bool kPacked = false;
-#endif
-
-using CompositedTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
-
 // Runs the forward pass. It sets splat_gradients to zero if they are given.
-CompositedTensors composite(const ListedSplats& splats, const std::optional<Tensor>& splat_gradients,
-                            bool clear_rest) {
+Tensors<6> composite(const ListedSplats& splats, const OptionalTensor& splat_gradients, bool clear_rest) {
   const TileGrid& grid = splats.grid;
   const Tensor& like = splats.means2d;
   const std::int64_t composited = grid.tile_end - grid.tile_begin;
@@ -28,7 +18,7 @@ CompositedTensors composite(const ListedSplats& splats, const std::optional<Tens
   const auto packed = make<std::uint8_t>(
       like, {splats.n_splats, backend::rasterize_splat_bytes(static_cast<int>(splats.n_channels))});
   DeviceScope scope(like);
-  return dispatch_floating(like, [&]<class T>() -> CompositedTensors {
+  return dispatch_floating(like, [&]<class T>() -> Tensors<6> {
     const auto renders = make<T>(like, {grid.n_cameras, grid.height, grid.width, splats.n_channels}),
                transmittances = make<T>(like, {grid.n_cameras, grid.height, grid.width});
     const RasterizeOutput<T> out{renders,
@@ -46,17 +36,14 @@ CompositedTensors composite(const ListedSplats& splats, const std::optional<Tens
 
 }  // namespace
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd(
-    const Tensor& means2d, const Tensor& conics, const Tensor& splat_opacities, const Tensor& colors,
-    const std::optional<Tensor>& backgrounds, const Tensor& isect_splats, const Tensor& tile_offsets,
-    std::int64_t n_cameras, std::int64_t width, std::int64_t height, std::int64_t tile_size,
-    std::int64_t tile_begin, std::int64_t tile_end, bool clear_rest, bool backward_follows,
-    const std::optional<Tensor>& known_splats) {
-  constexpr const char* kOp = "rasterize_fwd";
-  const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
-  ListedSplats splats(kOp, means2d, conics, splat_opacities, isect_splats, tile_offsets, grid, known_splats);
-  splats.set_colors(kOp, colors, backgrounds);
-  const bool packed = kPacked && backward_follows && splats.n_channels <= 4;
+Tensors<7> rasterize_fwd(const Tensor& means2d, const Tensor& conics, const Tensor& splat_opacities,
+                         const Tensor& colors, const OptionalTensor& backgrounds, const Tensor& isect_splats,
+                         const Tensor& tile_offsets, BLITZGS_TILES, bool clear_rest, bool backward_follows,
+                         const OptionalTensor& known_splats) {
+  const TileGrid grid = checked_tile_grid(n_cameras, width, height, tile_size, tile_begin, tile_end);
+  ListedSplats splats(means2d, conics, splat_opacities, isect_splats, tile_offsets, grid, known_splats);
+  splats.set_colors(colors, backgrounds);
+  const bool packed = kOnCuda && backward_follows && splats.n_channels <= 4;
   Tensor splat_gradients = make_empty(splats.means2d, {packed ? splats.n_splats : 0, kSplatGradient});
   auto composited = composite(splats, packed ? std::optional(splat_gradients) : std::nullopt, clear_rest);
   return std::tuple_cat(std::move(composited), std::tuple(splat_gradients));
@@ -65,56 +52,48 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_fwd
 namespace {
 
 // Checks a table of splat gradients that a caller gives (CUDA).
-void check_gradients(const char* op, const ListedSplats& splats, const Tensor& gradients) {
-  BLITZGS_CHECK(kPacked, op, "tables of gradients need CUDA");
-  BLITZGS_CHECK(splats.n_channels <= 4, op, "colors must have 1 to 4 channels, got ", splats.n_channels);
-  check_in_place(op, "gradients", gradients, ScalarType::Float, {-1, kSplatGradient});
-  BLITZGS_CHECK(gradients.size(0) >= splats.n_splats, op, "gradients must have ", splats.n_splats,
+void check_gradients(const ListedSplats& splats, const Tensor& gradients) {
+  BLITZGS_CHECK(kOnCuda, "tables of gradients need CUDA");
+  BLITZGS_CHECK(splats.n_channels <= 4, "colors must have 1 to 4 channels, got ", splats.n_channels);
+  check_in_place("gradients", gradients, ScalarType::Float, {-1, kSplatGradient});
+  BLITZGS_CHECK(gradients.size(0) >= splats.n_splats, "gradients must have ", splats.n_splats,
                 " splats or more, got ", gradients.size(0));
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
-    const std::vector<Tensor>& splats_in, const std::optional<Tensor>& backgrounds,
-    const std::vector<Tensor>& lists, const std::vector<Tensor>& composited, const Tensor& v_renders_in,
-    const std::optional<Tensor>& v_alphas_in, std::int64_t n_cameras, std::int64_t width, std::int64_t height,
-    std::int64_t tile_size, std::int64_t tile_begin, std::int64_t tile_end, bool absgrad, bool deterministic,
-    const std::optional<Tensor>& gradients) {
-  constexpr const char* kOp = "rasterize_bwd";
-  BLITZGS_CHECK(splats_in.size() == 4 && lists.size() == 2, kOp,
-                "splats must be (means2d, conics, splat_opacities, colors) and lists (isect_splats, "
-                "tile_offsets), got ",
-                splats_in.size(), " and ", lists.size(), " tensors");
-  BLITZGS_CHECK(composited.size() == 4, kOp,
-                "composited must be (transmittances, last_ids, packed_splats, tile_order), got ",
-                composited.size(), " tensors");
-  const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
-  ListedSplats splats(kOp, splats_in[0], splats_in[1], splats_in[2], lists[0], lists[1], grid);
-  splats.set_colors(kOp, splats_in[3], backgrounds);
-  if (gradients) check_gradients(kOp, splats, *gradients);
-  BLITZGS_CHECK(!gradients || !v_alphas_in, kOp, "v_alphas needs gradients in columns");
-  const auto last_ids = checked<std::int32_t>(kOp, "last_ids", composited[1], {n_cameras, height, width});
-  const auto order =
-      checked_in_place<std::int32_t>(kOp, "tile_order", composited[3], {-1, kTileOrderClasses});
+Tensors<5> rasterize_bwd(const TensorList& splats_in, const OptionalTensor& backgrounds,
+                         const TensorList& lists, const TensorList& composited, const Tensor& v_renders_in,
+                         const OptionalTensor& v_alphas_in, BLITZGS_TILES, bool absgrad, bool deterministic,
+                         const OptionalTensor& gradients) {
+  check_group("splats (means2d, conics, splat_opacities, colors)", splats_in, 4, 4);
+  check_group("lists (isect_splats, tile_offsets)", lists, 2, 2);
+  check_group("composited (transmittances, last_ids, packed_splats, tile_order)", composited, 4, 4);
+  const TileGrid grid = checked_tile_grid(n_cameras, width, height, tile_size, tile_begin, tile_end);
+  ListedSplats splats(splats_in[0], splats_in[1], splats_in[2], lists[0], lists[1], grid);
+  splats.set_colors(splats_in[3], backgrounds);
+  if (gradients) check_gradients(splats, *gradients);
+  BLITZGS_CHECK(!gradients || !v_alphas_in, "v_alphas needs gradients in columns");
+  const auto last_ids = checked<std::int32_t>("last_ids", composited[1], {n_cameras, height, width});
+  const auto order = checked_in_place<std::int32_t>("tile_order", composited[3], {-1, kTileOrderClasses});
   const auto packed = checked_in_place<std::uint8_t>(
-      kOp, "packed_splats", composited[2],
+      "packed_splats", composited[2],
       {-1, backend::rasterize_splat_bytes(static_cast<int>(splats.n_channels))});
   const bool ordered = order.size(0) > 0;
   // The number of tiles that the forward pass composited.
   const std::int64_t tiles = ordered ? order.size(0) - 1 : grid.count();
   BLITZGS_CHECK(packed.size(0) >= splats.n_splats && tiles >= grid.tile_end - grid.tile_begin &&
                     reinterpret_cast<std::uintptr_t>(packed.data()) % 64 == 0,
-                kOp, "packed_splats and tile_order must be as rasterize_fwd returned them, for ",
-                splats.n_splats, " splats and ", grid.tile_end - grid.tile_begin, " tiles or more, got ",
-                packed.size(0), " and ", tiles);
+                "packed_splats and tile_order must be as rasterize_fwd returned them, for ", splats.n_splats,
+                " splats and ", grid.tile_end - grid.tile_begin, " tiles or more, got ", packed.size(0),
+                " and ", tiles);
   const RasterizeAux aux{packed, packed.size(0), order.data_if(ordered), tiles};
   const Tensor& like = splats.means2d;
   const std::int64_t n_splats = gradients ? 0 : splats.n_splats, n_isects = splats.isect_splats.size(0);
   DeviceScope scope(like);
-  return dispatch_floating(like, [&]<class T>() -> std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> {
-    const auto transmittances = checked<T>(kOp, "transmittances", composited[0], {n_cameras, height, width}),
+  return dispatch_floating(like, [&]<class T>() -> Tensors<5> {
+    const auto transmittances = checked<T>("transmittances", composited[0], {n_cameras, height, width}),
                v_renders =
-                   checked<T>(kOp, "v_renders", v_renders_in, {n_cameras, height, width, splats.n_channels});
-    const auto v_alphas = checked<T>(kOp, "v_alphas", v_alphas_in, {n_cameras, height, width});
+                   checked<T>("v_renders", v_renders_in, {n_cameras, height, width, splats.n_channels});
+    const auto v_alphas = checked<T>("v_alphas", v_alphas_in, {n_cameras, height, width});
     const RasterizeSaved<T> saved{transmittances, last_ids, v_renders, v_alphas};
     const auto v_means2d = make<T>(like, {n_splats, 2}), v_conics = make<T>(like, {n_splats, 3}),
                v_opacities = make<T>(like, {n_splats}),
@@ -135,41 +114,35 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> rasterize_bwd(
 }
 
 #ifdef BLITZGS_BACKEND_CUDA
-CompositedTensors rasterize_fwd_into(const Tensor& means2d, const Tensor& conics,
-                                     const Tensor& splat_opacities, const Tensor& colors,
-                                     const std::optional<Tensor>& backgrounds, const Tensor& isect_splats,
-                                     const Tensor& tile_offsets, std::int64_t n_cameras, std::int64_t width,
-                                     std::int64_t height, std::int64_t tile_size, std::int64_t tile_begin,
-                                     std::int64_t tile_end, const Tensor& gradients,
-                                     const std::optional<Tensor>& known_splats) {
-  constexpr const char* kOp = "rasterize_fwd_";
-  const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, tile_begin, tile_end);
-  ListedSplats splats(kOp, means2d, conics, splat_opacities, isect_splats, tile_offsets, grid, known_splats);
-  splats.set_colors(kOp, colors, backgrounds);
-  check_gradients(kOp, splats, gradients);
+Tensors<6> rasterize_fwd_into(const Tensor& means2d, const Tensor& conics, const Tensor& splat_opacities,
+                              const Tensor& colors, const OptionalTensor& backgrounds,
+                              const Tensor& isect_splats, const Tensor& tile_offsets, BLITZGS_TILES,
+                              const Tensor& gradients, const OptionalTensor& known_splats) {
+  const TileGrid grid = checked_tile_grid(n_cameras, width, height, tile_size, tile_begin, tile_end);
+  ListedSplats splats(means2d, conics, splat_opacities, isect_splats, tile_offsets, grid, known_splats);
+  splats.set_colors(colors, backgrounds);
+  check_gradients(splats, gradients);
   return composite(splats, gradients, false);
 }
 #endif
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> pixel_splats(
-    const Tensor& means2d, const Tensor& conics, const Tensor& opacities, const Tensor& isect_splats,
-    const Tensor& tile_offsets, const std::optional<Tensor>& slots_in, std::int64_t n_rows,
-    std::int64_t n_cameras, std::int64_t width, std::int64_t height, std::int64_t tile_size,
-    std::int64_t strongest) {
-  constexpr const char* kOp = "pixel_splats";
-  const TileGrid grid = checked_tile_grid(kOp, n_cameras, width, height, tile_size, 0, -1);
-  const ListedSplats splats(kOp, means2d, conics, opacities, isect_splats, tile_offsets, grid);
-  const auto slots = checked<std::int32_t>(kOp, "slots", slots_in, {n_cameras, height, width});
-  BLITZGS_CHECK(strongest >= 0 && strongest < (1 << 24), kOp, "strongest must be 0 to 2^24 - 1, got ",
-                strongest);
-  BLITZGS_CHECK(slots ? n_rows >= 0 : n_rows == n_cameras * width * height, kOp,
+Tensors<5> pixel_splats(const Tensor& means2d, const Tensor& conics, const Tensor& opacities,
+                        const Tensor& isect_splats, const Tensor& tile_offsets,
+                        const OptionalTensor& slots_in, std::int64_t n_rows, std::int64_t n_cameras,
+                        std::int64_t width, std::int64_t height, std::int64_t tile_size,
+                        std::int64_t strongest) {
+  const TileGrid grid = checked_tile_grid(n_cameras, width, height, tile_size, 0, -1);
+  const ListedSplats splats(means2d, conics, opacities, isect_splats, tile_offsets, grid);
+  const auto slots = checked<std::int32_t>("slots", slots_in, {n_cameras, height, width});
+  BLITZGS_CHECK(strongest >= 0 && strongest < (1 << 24), "strongest must be 0 to 2^24 - 1, got ", strongest);
+  BLITZGS_CHECK(slots ? n_rows >= 0 : n_rows == n_cameras * width * height,
                 "n_rows must be the number of rows that slots name, and without slots the number of "
                 "pixels, got ",
                 n_rows);
   const auto counts = make<std::int32_t>(means2d, {n_rows}), medians = make<std::int32_t>(means2d, {n_rows}),
              ids = make<std::int32_t>(means2d, {n_rows, strongest});
   DeviceScope scope(means2d);
-  return dispatch_floating(means2d, [&]<class T>() -> std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> {
+  return dispatch_floating(means2d, [&]<class T>() -> Tensors<5> {
     const auto transmittances = make<T>(means2d, {n_rows}), weights = make<T>(means2d, {n_rows, strongest});
     backend::pixel_splats<T>(
         splats.input<T>(),
@@ -183,10 +156,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> pixel_splats(
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) {
-  m.impl("rasterize_fwd", TORCH_BOX(&blitzgs::rasterize_fwd));
-  m.impl("rasterize_bwd", TORCH_BOX(&blitzgs::rasterize_bwd));
-  m.impl("pixel_splats", TORCH_BOX(&blitzgs::pixel_splats));
+  BLITZGS_OP(m, "rasterize_fwd", rasterize_fwd);
+  BLITZGS_OP(m, "rasterize_bwd", rasterize_bwd);
+  BLITZGS_OP(m, "pixel_splats", pixel_splats);
 #ifdef BLITZGS_BACKEND_CUDA
-  m.impl("rasterize_fwd_", TORCH_BOX(&blitzgs::rasterize_fwd_into));
+  BLITZGS_OP(m, "rasterize_fwd_", rasterize_fwd_into);
 #endif
 }

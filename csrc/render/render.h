@@ -20,17 +20,17 @@ struct Alphas {
 };
 
 // Gathers the same rows of several columns in one launch. A row of a column has `width` words of 4 bytes:
-//   column.to[i stride + k] = column.from[ids[i] from_stride + k],  0 <= i < n,  0 <= k < width.
-// With a stride above the width, several columns are gathered side by side into one; with a from_stride above
-// the width, a column is a part of wider rows. ids int32 [n], rows of the columns, not checked; null: 0 to n
-// - 1. known: null, or (CUDA) the number of valid ids, see valid_splat_count in common/kernel.h.
+//   column.to[i stride + k] = column.from[ids[i] width + k],  0 <= i < n,  0 <= k < width.
+// With a stride above the width, several columns are gathered side by side into one. ids int32 [n], rows of
+// the columns, not checked. known: null, or (CUDA) the number of valid ids, see valid_splat_count in
+// common/kernel.h.
 
 constexpr int kMaxGatheredColumns = 8;
 
 struct GatheredColumn {
   const std::uint32_t* from;
   std::uint32_t* to;
-  std::int64_t from_stride, stride;
+  std::int64_t stride;
   std::uint32_t width;
 };
 

@@ -11,16 +11,13 @@ void gather_rows(const GatherRows& gather, CudaStream) {
     for (int c = 0; c < gather.n_columns; ++c) {
       const GatheredColumn& column = gather.columns[c];
       for (std::int64_t i = begin; i < end; ++i) {
-        const std::int64_t row = gather.ids ? gather.ids[i] : i;
-        std::copy_n(column.from + row * column.from_stride, column.width, column.to + i * column.stride);
+        const std::int64_t row = gather.ids[i];
+        std::copy_n(column.from + row * column.width, column.width, column.to + i * column.stride);
       }
     }
   });
 }
 
-void zero_words(std::uint32_t* words, std::int64_t n, CudaStream) {
-  parallel_for(0, n, 1 << 14,
-               [&](std::int64_t begin, std::int64_t end) { std::fill(words + begin, words + end, 0u); });
-}
+void zero_words(std::uint32_t* words, std::int64_t n, CudaStream) { parallel_zero(words, n); }
 
 }  // namespace blitzgs::cpu

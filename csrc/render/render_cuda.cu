@@ -18,17 +18,14 @@ __global__ void __launch_bounds__(kThreads) gather_rows_kernel(const __grid_cons
   const std::int64_t left = valid_splat_count(gather.n, gather.known) - first;
   if (left <= 0) return;
   const auto n = static_cast<std::uint32_t>(left < kThreads ? left : kThreads);
-  if (threadIdx.x < n) {
-    const std::int64_t i = first + threadIdx.x;
-    rows[threadIdx.x] = gather.ids ? gather.ids[i] : i;
-  }
+  if (threadIdx.x < n) rows[threadIdx.x] = gather.ids[first + threadIdx.x];
   __syncthreads();
   const std::uint32_t width = column.width;
   std::uint32_t* to = column.to + first * column.stride;
 #pragma unroll 4
   for (std::uint32_t i = threadIdx.x; i < n * width; i += kThreads) {
     const std::uint32_t place = i / width, k = i - place * width;
-    to[place * column.stride + k] = column.from[rows[place] * column.from_stride + k];
+    to[place * column.stride + k] = column.from[rows[place] * width + k];
   }
 }
 

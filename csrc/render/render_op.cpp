@@ -5,7 +5,6 @@
 #include <numeric>
 #include <tuple>
 
-#include "common/rows.h"
 #include "project/project_op.h"
 #include "rasterize/rasterize_op.h"
 
@@ -14,73 +13,59 @@ namespace blitzgs {
 // microseconds.
 namespace {
 
-constexpr const char* kRender = "render";
-
-// The first `length` rows of a tensor, or all if it has no more.
-Tensor rows_of(const Tensor& tensor, std::int64_t length) {
-  std::vector<std::int64_t> shape, strides;
-  for (std::int64_t axis = 0; axis < tensor.dim(); ++axis) {
-    shape.push_back(tensor.size(axis));
-    strides.push_back(tensor.stride(axis));
-  }
-  shape[0] = std::min(shape[0], length);
-  return view_of(tensor, shape, strides, 0);
-}
-
 // Words of 4 bytes in the elements of a row behind its first `axis` dimensions.
 std::int64_t words_behind(const Tensor& column, std::int64_t axis) {
   return static_cast<std::int64_t>(column.element_size()) / 4 * elements_behind(column, axis);
 }
 
-void check_column(const char* op, const Tensor& column) {
-  BLITZGS_CHECK(column.dim() >= 1 && column.element_size() % 4 == 0, op,
+void check_column(const Tensor& column) {
+  BLITZGS_CHECK(column.dim() >= 1 && column.element_size() % 4 == 0,
                 "columns must have rows and elements of 4 or 8 bytes, got ", shape_of(column), " of ",
                 column.element_size(), " bytes");
-  BLITZGS_CHECK(words_behind(column, 1) < (1 << 16), op, "rows must be shorter than 256 KiB, got ",
+  BLITZGS_CHECK(words_behind(column, 1) < (1 << 16), "rows must be shorter than 256 KiB, got ",
                 shape_of(column));
 }
 
-std::vector<std::int64_t> shape_with(const Tensor& column, std::int64_t rows) {
-  std::vector<std::int64_t> shape{rows};
+IntList shape_with(const Tensor& column, std::int64_t rows) {
+  IntList shape{rows};
   for (std::int64_t axis = 1; axis < column.dim(); ++axis) shape.push_back(column.size(axis));
   return shape;
 }
 
 // The rows `ids` of `columns`, and then of `joined`, side by side along their second dimension. ids: int32
 // [n], contiguous; known: as in GatherRows.
-std::vector<Tensor> gathered_rows(const char* op, const std::vector<Tensor>& columns,
-                                  const std::vector<Tensor>& joined, const Tensor& ids,
-                                  const std::int64_t* known) {
-  BLITZGS_CHECK(columns.size() + joined.size() <= kMaxGatheredColumns, op, "at most ", kMaxGatheredColumns,
+TensorList gathered_rows(const TensorList& columns, const TensorList& joined, const Tensor& ids,
+                         const std::int64_t* known) {
+  BLITZGS_CHECK(columns.size() + joined.size() <= kMaxGatheredColumns, "at most ", kMaxGatheredColumns,
                 " columns, got ", columns.size() + joined.size());
   const std::int64_t n = ids.size(0);
   GatherRows gather{data<std::int32_t>(ids), n, known, 0, {}};
-  std::vector<Tensor> held, found;
+  TensorList held, found;
   const auto add = [&](const Tensor& column, std::uint32_t* to, std::int64_t stride) {
     const Tensor& from = held.emplace_back(as_contiguous(column));
     const auto width = static_cast<std::uint32_t>(words_behind(from, 1));
-    gather.columns[gather.n_columns++] = {static_cast<const std::uint32_t*>(from.const_data_ptr()), to, width,
+    gather.columns[gather.n_columns++] = {static_cast<const std::uint32_t*>(from.const_data_ptr()), to,
                                           stride, width};
     return width;
   };
   for (const Tensor& column : columns) {
-    check_column(op, column);
+    check_column(column);
     Tensor& rows = found.emplace_back(make_empty(column, shape_with(column, n)));
     add(column, static_cast<std::uint32_t*>(rows.mutable_data_ptr()), words_behind(column, 1));
   }
   if (!joined.empty()) {
     std::int64_t length = 0, stride = 0;
     for (const Tensor& part : joined) {
-      check_column(op, part);
-      check_dtype(op, "joined columns", part, joined[0].scalar_type());
+      check_column(part);
+      check_dtype("joined columns", part, joined[0].scalar_type());
       BLITZGS_CHECK(part.dim() >= 2 && part.dim() == joined[0].dim() &&
                         words_behind(part, 2) == words_behind(joined[0], 2),
-                    op, "joined columns must be alike behind their second dimension, got ", shape_of(part),
+                    "joined columns must be alike behind their second dimension, got ", shape_of(part),
                     " beside ", shape_of(joined[0]));
       length += part.size(1);
       stride += words_behind(part, 1);
     }
-    std::vector<std::int64_t> shape = shape_with(joined[0], n);
+    IntList shape = shape_with(joined[0], n);
     shape[1] = length;
     Tensor& rows = found.emplace_back(make_empty(joined[0], shape));
     auto* to = static_cast<std::uint32_t*>(rows.mutable_data_ptr());
@@ -91,16 +76,17 @@ std::vector<Tensor> gathered_rows(const char* op, const std::vector<Tensor>& col
   return found;
 }
 
-std::vector<Tensor> first_rows(const std::vector<Tensor>& columns, const std::vector<std::int64_t>& lengths) {
-  constexpr const char* kOp = "first_rows";
-  BLITZGS_CHECK(columns.size() == lengths.size(), kOp, columns.size(), " columns need a length each, got ",
+TensorList first_rows(const TensorList& columns, const IntList& lengths) {
+  BLITZGS_CHECK(columns.size() == lengths.size(), columns.size(), " columns need a length each, got ",
                 lengths.size());
-  std::vector<Tensor> found;
+  TensorList found;
   for (std::size_t c = 0; c < columns.size(); ++c) {
-    BLITZGS_CHECK(columns[c].dim() >= 1 && lengths[c] >= 0, kOp,
+    BLITZGS_CHECK(columns[c].dim() >= 1 && lengths[c] >= 0,
                   "columns must have rows, and lengths be at least 0, got ", shape_of(columns[c]), " and ",
                   lengths[c]);
-    found.push_back(rows_of(columns[c], lengths[c]));
+    IntList shape = shape_with(columns[c], std::min(columns[c].size(0), lengths[c])), strides;
+    for (std::int64_t axis = 0; axis < columns[c].dim(); ++axis) strides.push_back(columns[c].stride(axis));
+    found.push_back(view_of(columns[c], shape, strides, 0));
   }
   return found;
 }
@@ -108,12 +94,10 @@ std::vector<Tensor> first_rows(const std::vector<Tensor>& columns, const std::ve
 // The totals of the projection; null: the splats have no spare capacity.
 const std::int64_t* checked_totals(const OptionalTensor& totals) {
   if (!totals) return nullptr;
-  check_in_place(kRender, "totals", *totals, ScalarType::Long, {-1});
-  BLITZGS_CHECK(totals->size(0) > kTotalSplats, kRender, "totals must be those of project_fwd, got ",
+  check_in_place("totals", *totals, ScalarType::Long, {-1});
+  BLITZGS_CHECK(totals->size(0) > kTotalSplats, "totals must be those of project_fwd, got ",
                 shape_of(*totals));
-#ifndef BLITZGS_BACKEND_CUDA
-  BLITZGS_CHECK(false, kRender, "on the CPU splats have no spare capacity, so give no totals");
-#endif
+  BLITZGS_CHECK(kOnCuda, "on the CPU splats have no spare capacity, so give no totals");
   return data<std::int64_t>(*totals);
 }
 
@@ -126,20 +110,19 @@ struct ColoredSplats {
 TensorList color_rows(const TensorList& gaussians, const TensorList& sh, const Tensor& viewmats,
                       const Tensor& Ks, const ProjectOptions<double>& options, const ColoredSplats& splats,
                       const std::int64_t* totals) {
-  check_group(kRender, "gaussians (means, quats, scales, opacities)", gaussians, 4, 4);
-  check_floating(kRender, "means", gaussians[0]);
+  check_group("gaussians (means, quats, scales, opacities)", gaussians, 4, 4);
+  check_floating("means", gaussians[0]);
   const std::int64_t U = splats.visible_ids.numel(), P = splats.camera_ids.numel();
-  const auto visible_ids = checked_in_place<std::int32_t>(kRender, "visible_ids", splats.visible_ids, {U}),
-             offsets =
-                 checked_in_place<std::int32_t>(kRender, "splat_offsets", splats.splat_offsets, {U + 1}),
-             camera_ids = checked_in_place<std::int32_t>(kRender, "camera_ids", splats.camera_ids, {P}),
-             radii = checked_in_place<std::int32_t>(kRender, "radii", splats.radii, {P, 2}),
-             tiles = checked_in_place<std::int32_t>(kRender, "tiles_touched", splats.tiles_touched, {P});
-  check_in_place(kRender, "splat_opacities", splats.opacities, gaussians[0].scalar_type(), {P});
+  const auto visible_ids = checked_in_place<std::int32_t>("visible_ids", splats.visible_ids, {U}),
+             offsets = checked_in_place<std::int32_t>("splat_offsets", splats.splat_offsets, {U + 1}),
+             camera_ids = checked_in_place<std::int32_t>("camera_ids", splats.camera_ids, {P}),
+             radii = checked_in_place<std::int32_t>("radii", splats.radii, {P, 2}),
+             tiles = checked_in_place<std::int32_t>("tiles_touched", splats.tiles_touched, {P});
+  check_in_place("splat_opacities", splats.opacities, gaussians[0].scalar_type(), {P});
   const ProjectCapacity capacity{{U, P}, totals};
   TensorList found =
-      gathered_rows(kRender, gaussians, sh, splats.visible_ids, totals ? totals + kTotalVisible : nullptr);
-  const ProjectArguments p(kRender, found, viewmats, Ks, options);
+      gathered_rows(gaussians, sh, splats.visible_ids, totals ? totals + kTotalVisible : nullptr);
+  const ProjectArguments p(found, viewmats, Ks, options);
   const auto numbers = make<std::int32_t>(visible_ids, {U});
   const auto indices = make<std::int64_t>(visible_ids, {U});
   const Tensor colors = make_empty(p.means, {p.sh ? P : 0, 3});
@@ -184,12 +167,12 @@ TensorList render(const Tensor& means2d, const Tensor& conics, const Tensor& spl
   if (totals) n_splats = view_of(*totals_in, {1}, {1}, kTotalSplats);
   TensorList rows;
   if (!gaussians.empty()) {
-    const auto options = checked_options(kRender, BLITZGS_PROJECT_OPTION_NAMES, fade);
+    const auto options = checked_options(BLITZGS_PROJECT_OPTION_NAMES, fade);
     rows =
         color_rows(gaussians, sh, viewmats, Ks, options,
                    {visible_ids, splat_offsets, camera_ids, splat_opacities, radii, tiles_touched}, totals);
   }
-  BLITZGS_CHECK(channels_in || !sh.empty(), kRender, "splats without sh need channels");
+  BLITZGS_CHECK(channels_in || !sh.empty(), "splats without sh need channels");
   const Tensor channels = channels_in ? *channels_in : with_depth ? joined(rows[0], depths) : rows[0];
   const std::int64_t views = viewmats.size(0);
   const auto lists = intersect(means2d, conics, splat_opacities, depths, camera_ids, std::nullopt, views,
@@ -199,10 +182,8 @@ TensorList render(const Tensor& means2d, const Tensor& conics, const Tensor& spl
                                      0, -1, /*clear_rest=*/true, backward_follows, n_splats);
   const Tensor& transmittances = std::get<1>(outputs);
   const Tensor alphas = make_empty(transmittances, {views, height, width});
-  DeviceScope scope(alphas);
   dispatch_floating(alphas, [&]<class T>() {
-    backend::for_each_row(Alphas<T>{data<T>(transmittances), mutable_data<T>(alphas), alphas.numel()},
-                          scope.stream);
+    run_rows(alphas, Alphas<T>{data<T>(transmittances), mutable_data<T>(alphas), alphas.numel()});
   });
   TensorList found = std::apply([&](const auto&... tensors) { return TensorList{tensors..., alphas}; },
                                 std::tuple_cat(lists, outputs));
@@ -210,28 +191,26 @@ TensorList render(const Tensor& means2d, const Tensor& conics, const Tensor& spl
   return found;
 }
 
-constexpr const char* kArrangeSplats = "arrange_splats";
-
 // Where the splats are in the arrangement, which has the dimensions `shape`.
 struct Places {
-  std::vector<Tensor> index;
-  std::vector<std::int64_t> shape;
+  TensorList index;
+  IntList shape;
   ArrangeSplats moves{};
 
-  Places(const std::vector<Tensor>& places, const std::vector<std::int64_t>& dimensions) : shape(dimensions) {
-    BLITZGS_CHECK(places.size() == 1 || places.size() == 2, kArrangeSplats,
+  Places(const TensorList& places, const IntList& dimensions) : shape(dimensions) {
+    BLITZGS_CHECK(places.size() == 1 || places.size() == 2,
                   "places must be (order) or (images, gaussians), got ", places.size(), " tensors");
     const bool ordered = places.size() == 1;
-    BLITZGS_CHECK(shape.size() >= (ordered ? 1u : 2u), kArrangeSplats, "shape has too few dimensions");
+    BLITZGS_CHECK(shape.size() >= (ordered ? 1u : 2u), "shape has too few dimensions");
     for (const Tensor& tensor : places) {
-      check_dtype(kArrangeSplats, ordered ? "order" : "images and gaussians", tensor,
+      check_dtype(ordered ? "order" : "images and gaussians", tensor,
                   ordered ? ScalarType::Long : ScalarType::Int);
-      check_shape(kArrangeSplats, "places", tensor, {places[0].size(0)});
+      check_shape("places", tensor, {places[0].size(0)});
       index.push_back(as_contiguous(tensor));
     }
     moves.n = index[0].size(0);
     moves.count = shape.back();
-    BLITZGS_CHECK(!ordered || entries() == moves.n, kArrangeSplats, "an arrangement of ", entries(),
+    BLITZGS_CHECK(!ordered || entries() == moves.n, "an arrangement of ", entries(),
                   " entries cannot be an order of ", moves.n, " splats");
     moves.order = ordered ? data<std::int64_t>(index[0]) : nullptr;
     moves.images = ordered ? nullptr : data<std::int32_t>(index[0]);
@@ -256,20 +235,17 @@ bool rows_are_contiguous(const Tensor& column, std::int64_t row_axis) {
 
 // Allocates the targets of columns whose rows are indexed by the first `from` dimensions, with the dimensions
 // `to` in place of these, and lists both in `moves`. `held` keeps the sources alive.
-std::vector<Tensor> make_targets(const std::vector<Tensor>& columns, std::size_t from,
-                                 const std::vector<std::int64_t>& to, std::vector<Tensor>& held,
-                                 ArrangeSplats& moves) {
-  BLITZGS_CHECK(columns.size() <= kMaxArranged, kArrangeSplats, "at most ", kMaxArranged, " columns, got ",
-                columns.size());
-  std::vector<Tensor> targets;
+TensorList make_targets(const TensorList& columns, std::size_t from, const IntList& to, TensorList& held,
+                        ArrangeSplats& moves) {
+  BLITZGS_CHECK(columns.size() <= kMaxArranged, "at most ", kMaxArranged, " columns, got ", columns.size());
+  TensorList targets;
   for (const Tensor& column : columns) {
     // Rows of a splat's gradient lie in a longer table: a column of it is read as it is.
     const bool strided = from == 1 && rows_are_contiguous(column, 1);
     held.push_back(strided ? column : as_contiguous(column));
-    BLITZGS_CHECK(column.element_size() % 4 == 0, kArrangeSplats,
-                  "columns must have elements of 4 or 8 bytes, got ",
+    BLITZGS_CHECK(column.element_size() % 4 == 0, "columns must have elements of 4 or 8 bytes, got ",
                   torch::headeronly::toString(column.scalar_type()));
-    std::vector<std::int64_t> shape = to;
+    IntList shape = to;
     for (auto axis = static_cast<std::int64_t>(from); axis < column.dim(); ++axis) {
       shape.push_back(column.size(axis));
     }
@@ -283,25 +259,24 @@ std::vector<Tensor> make_targets(const std::vector<Tensor>& columns, std::size_t
   return targets;
 }
 
-std::vector<Tensor> arrange_splats(const std::vector<Tensor>& columns, const std::vector<Tensor>& places_in,
-                                   const std::vector<std::int64_t>& shape,
-                                   const std::optional<Tensor>& under) {
+TensorList arrange_splats(const TensorList& columns, const TensorList& places_in, const IntList& shape,
+                          const OptionalTensor& under) {
   Places places(places_in, shape);
-  std::vector<Tensor> held;
+  TensorList held;
   if (columns.empty()) return {};
   for (const Tensor& column : columns) {
-    BLITZGS_CHECK(column.dim() >= 1 && column.size(0) == places.moves.n, kArrangeSplats, "columns must have ",
-                  places.moves.n, " rows, got ", shape_of(column));
+    BLITZGS_CHECK(column.dim() >= 1 && column.size(0) == places.moves.n, "columns must have ", places.moves.n,
+                  " rows, got ", shape_of(column));
   }
-  std::vector<Tensor> arranged = make_targets(columns, 1, shape, held, places.moves);
-  std::optional<Tensor> below;
+  TensorList arranged = make_targets(columns, 1, shape, held, places.moves);
+  OptionalTensor below;
   const std::int64_t views = places.has_empty_entries() ? shape[shape.size() - 2] : 1;
   if (under) {
     const Tensor& last = columns.back();
-    BLITZGS_CHECK(places.has_empty_entries() && last.dim() == 1, kArrangeSplats,
+    BLITZGS_CHECK(places.has_empty_entries() && last.dim() == 1,
                   "`under` is for a last column of numbers and an arrangement of all Gaussians");
-    check_dtype(kArrangeSplats, "under", *under, last.scalar_type());
-    BLITZGS_CHECK(under->numel() * views == places.entries(), kArrangeSplats, "under must have ",
+    check_dtype("under", *under, last.scalar_type());
+    BLITZGS_CHECK(under->numel() * views == places.entries(), "under must have ",
                   places.entries() / std::max<std::int64_t>(views, 1), " values, got ", shape_of(*under));
     below = as_contiguous(*under);
   }
@@ -320,21 +295,18 @@ std::vector<Tensor> arrange_splats(const std::vector<Tensor>& columns, const std
   return arranged;
 }
 
-std::vector<Tensor> splats_of_arranged(const std::vector<Tensor>& arranged,
-                                       const std::vector<Tensor>& places_in,
-                                       const std::vector<std::int64_t>& shape) {
+TensorList splats_of_arranged(const TensorList& arranged, const TensorList& places_in, const IntList& shape) {
   Places places(places_in, shape);
-  std::vector<Tensor> held;
+  TensorList held;
   if (arranged.empty()) return {};
   for (const Tensor& column : arranged) {
     bool fits = column.dim() >= static_cast<std::int64_t>(shape.size());
     for (std::size_t axis = 0; fits && axis < shape.size(); ++axis) {
       fits = column.size(static_cast<std::int64_t>(axis)) == shape[axis];
     }
-    BLITZGS_CHECK(fits, kArrangeSplats, "columns must begin with the dimensions of the arrangement, got ",
-                  shape_of(column));
+    BLITZGS_CHECK(fits, "columns must begin with the dimensions of the arrangement, got ", shape_of(column));
   }
-  std::vector<Tensor> splats = make_targets(arranged, shape.size(), {places.moves.n}, held, places.moves);
+  TensorList splats = make_targets(arranged, shape.size(), {places.moves.n}, held, places.moves);
   DeviceScope scope(arranged[0]);
   places.moves.back = true;
   backend::for_each_row(places.moves, scope.stream);
@@ -345,8 +317,8 @@ std::vector<Tensor> splats_of_arranged(const std::vector<Tensor>& arranged,
 }  // namespace blitzgs
 
 BLITZGS_REGISTER(m) {
-  m.impl("render", TORCH_BOX(&blitzgs::render));
-  m.impl("first_rows", TORCH_BOX(&blitzgs::first_rows));
-  m.impl("arrange_splats", TORCH_BOX(&blitzgs::arrange_splats));
-  m.impl("splats_of_arranged", TORCH_BOX(&blitzgs::splats_of_arranged));
+  BLITZGS_OP(m, "render", render);
+  BLITZGS_OP(m, "first_rows", first_rows);
+  BLITZGS_OP(m, "arrange_splats", arrange_splats);
+  BLITZGS_OP(m, "splats_of_arranged", splats_of_arranged);
 }
