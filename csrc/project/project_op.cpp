@@ -25,15 +25,6 @@ RankTiles checked_rank_tiles(const IntList& begins_and_ends) {
   return ranks;
 }
 
-std::optional<ProjectSizes> checked_capacity(std::optional<std::int64_t> visible,
-                                             std::optional<std::int64_t> splats) {
-  BLITZGS_CHECK(
-      visible.has_value() == splats.has_value() && visible.value_or(1) > 0 && splats.value_or(1) > 0,
-      "capacity must be how many visible Gaussians and splats there is room for, at least 1 each");
-  if (!visible) return std::nullopt;
-  return ProjectSizes{*visible, *splats};
-}
-
 // The columns of the splats, in the order in which the op returns them, and the totals.
 Tensors<14> project_fwd(const TensorList& gaussians, const Tensor& viewmats, const Tensor& Ks,
                         const OptionalTensor& active_ids, const OptionalTensor& active_views,
@@ -53,7 +44,10 @@ Tensors<14> project_fwd(const TensorList& gaussians, const Tensor& viewmats, con
              blocks = checked<std::int32_t>("n_blocks", n_blocks, {1});
   const std::int64_t listed = max_listed(n_active, length);
   const RankTiles ranks = checked_rank_tiles(rank_tiles);
-  const std::optional<ProjectSizes> sizes = checked_capacity(visible_capacity, splat_capacity);
+  BLITZGS_CHECK(visible_capacity.has_value() == splat_capacity.has_value() &&
+                    visible_capacity.value_or(1) > 0 && splat_capacity.value_or(1) > 0,
+                "capacity must be how many visible Gaussians and splats there is room for, at least 1 each");
+  const ProjectSizes capacity{visible_capacity.value_or(0), splat_capacity.value_or(0)};
   const auto persistent = checked<std::int64_t>("ids", ids, {p.count});
   const auto totals = make<std::int64_t>(p.means, {project_totals(p.n_views, ranks.n_ranks)});
   std::array<Tensor, 13> columns;
@@ -87,7 +81,8 @@ Tensors<14> project_fwd(const TensorList& gaussians, const Tensor& viewmats, con
                add(kLong, {with_masks ? P : 0}).data_if(with_masks),
                add(kLong, {with_ids ? P : 0}).data_if(with_ids), persistent}};
     };
-    backend::project<T>(in, ranks, sizes ? &*sizes : nullptr, memory, totals, scope.workspace, scope.stream);
+    backend::project<T>(in, ranks, visible_capacity ? &capacity : nullptr, memory, totals, scope.workspace,
+                        scope.stream);
   });
   return std::tuple_cat(columns, std::tuple<Tensor>(totals));
 }
