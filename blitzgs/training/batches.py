@@ -9,7 +9,6 @@ import time
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -46,13 +45,16 @@ _DECODED_AHEAD = 4
 MAX_MASKED = 0.95
 
 
-class _Plan(NamedTuple):
+@dataclass
+class _Plan:
     """What is known about a batch before its photographs are decoded; see `Batch`."""
 
     indices: list[int]
     ranges: TileRanges | None
     rows: list[tuple[int, int]]  # the pixel rows [y0, y1) of each view that this rank needs
     reduction: int  # by which factor the photographs are reduced
+    is_prefetched: bool = False  # whether its photographs are being decoded
+    loading: Future[tuple[Batch, _Slot]] | None = None
 
 
 # The part of a view's photograph that a batch needs: pixel rows, the mask, and `Batch.samples`.
@@ -156,9 +158,7 @@ class BatchLoader:
         self._device = device
         self._ahead = ahead
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
-        self._plans: dict[int, _Plan] = {}
-        self._prefetched: set[int] = set()  # the steps whose photographs are being decoded
-        self._pending: dict[int, Future[tuple[Batch, _Slot]]] = {}
+        self._plans: dict[int, _Plan] = {}  # by step
         # One slot is in use; the others hold batches that are ready or being prepared.
         self._free = deque(_Slot(device) for _ in range(ahead + 2))
         self._current: _Slot | None = None
@@ -177,20 +177,19 @@ class BatchLoader:
         if step in self._plans and self._plans[step].reduction != self._sampler.reduction(step):
             self._drop(step)  # the pace of the run has changed since
         for later in range(step, max(step + 1, min(step + (1 + _DECODED_AHEAD) * self._ahead + 1, last))):
-            is_near = later <= step + self._ahead
-            if later not in self._plans:
-                self._plans[later] = self._plan(later)
-                if not is_near and self._has_room(later - step, self._plans[later]):
-                    self._prefetch(later)
-            if is_near and later not in self._pending:
-                if later not in self._prefetched:  # there was no room for its photographs before
-                    self._prefetch(later)
-                self._pending[later] = self._worker.submit(self._load, self._plans[later])
-        begin = time.perf_counter()
-        batch, slot = self._pending.pop(step).result()
+            plan, is_near = self._plans.get(later), later <= step + self._ahead
+            if plan is None:
+                plan = self._plans[later] = self._plan(later)
+                if not is_near and self._has_room(later - step, plan):
+                    self._prefetch(plan)
+            if is_near and plan.loading is None:
+                if not plan.is_prefetched:  # there was no room for its photographs before
+                    self._prefetch(plan)
+                plan.loading = self._worker.submit(self._load, plan)
+        begin, loading = time.perf_counter(), self._plans.pop(step).loading
+        assert loading is not None
+        batch, slot = loading.result()
         self.waited += time.perf_counter() - begin
-        del self._plans[step]
-        self._prefetched.discard(step)
         if stream is not None:
             stream.wait_event(slot.uploaded)
         self._current = slot
@@ -222,15 +221,12 @@ class BatchLoader:
         return _Plan(indices, ranges, ranges.pixel_rows(self._owners.ranks.rank), reduction)
 
     def _drop(self, step: int) -> None:
-        del self._plans[step]
-        self._prefetched.discard(step)
-        if step in self._pending:
+        if (loading := self._plans.pop(step).loading) is not None:
             with contextlib.suppress(OSError, ValueError):
-                self._give_back(self._pending.pop(step).result()[1])
+                self._give_back(loading.result()[1])
 
-    def _prefetch(self, step: int) -> None:
-        plan = self._plans[step]
-        self._prefetched.add(step)
+    def _prefetch(self, plan: _Plan) -> None:
+        plan.is_prefetched = True
         needed = [index for index, (y0, y1) in zip(plan.indices, plan.rows, strict=True) if y0 < y1]
         self._images.prefetch(needed, plan.indices, plan.reduction)
 
@@ -274,8 +270,8 @@ class BatchLoader:
         return strip, mask, self._sample_counts[index, reduction]
 
     def _fill(self, slot: _Slot, plan: _Plan, photographs: list[_Photograph]) -> Batch:
-        indices, ranges, rows, reduction = plan
-        count, (width, height) = len(indices), self._views.size(indices, reduction)
+        indices, rows = plan.indices, plan.rows
+        count, (width, height) = len(indices), self._views.size(indices, plan.reduction)
         strips, masks, samples = zip(*photographs, strict=True)
         if self._stream is not None:
             slot.uploaded.synchronize()  # returns at once: this upload ended long ago
@@ -287,12 +283,12 @@ class BatchLoader:
         if slot.included is not None:
             for place, mask in zip(slot.included, masks, strict=True):
                 place[...] = 1 if mask is None else mask.numpy()
-        self._views.write(indices, slot.numbers[:-count], reduction)
+        self._views.write(indices, slot.numbers[:-count], plan.reduction)
         slot.numbers[-count:] = samples
         slot.upload(rows)
         if self._stream is not None:
             slot.uploaded.record(self._stream)
-        return slot.batch(indices, ranges)
+        return slot.batch(indices, plan.ranges)
 
 
 def _aligned(size: int) -> int:
