@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Schedules, and those whose pace changes during a run."""
 
-import itertools
 import math
 import random
 from dataclasses import replace
@@ -10,7 +9,6 @@ import pytest
 import torch
 
 from blitzgs.config.fields import OptimiserConfig, ScheduleConfig
-from blitzgs.config.files import from_dict, load_config, save_config, to_dict
 from blitzgs.config.schedule import Pace, Schedule, stretched
 from blitzgs.optim.table_adam import BETA1, BETA2, EPS, TableAdam
 from tests.training.tiny import random_gaussians
@@ -117,17 +115,23 @@ def test_size_pruning_starts_after_its_time():
     assert schedule.prunes_by_size(1_501)
 
 
-def test_learning_rates():
+@pytest.mark.parametrize("pace", [(), ((100, 0.5), (200, 4.0))])
+def test_learning_rates(pace):
     config = OptimiserConfig(final=0.1)
-    times = ScheduleConfig(iterations=1_000, batch_size=4, densify_until=100, position_decay=500)
+    times = ScheduleConfig(iterations=1_000, batch_size=4, densify_until=100, position_decay=500, pace=pace)
     schedule = Schedule(times)
+    # With changes, 100 images more are the next 200 of the configuration, and 4 are one of the rest.
+    assert schedule.iterations == (200 + 700 * 4 if pace else 1_000)
     table = schedule.learning_rates(config, extent=2.0).double()
-    assert table.shape == (251, 6)
+    assert table.shape == (schedule.steps + 1, 6)
     assert not table[0].any()
-    for step in (1, 2, 77, 126, 250):
-        fraction = min((step - 1) * 4 / 500, 1.0)
-        position = 2.0 * math.exp(math.log(config.position) - fraction * math.log(100))
-        share = 0.1 ** min(max((step - 1) * 4 - 100, 0) / 400, 1.0)
+    for step in (1, 2, 20, 38, 77, 126, 250):
+        image = (step - 1) * 4
+        time = image
+        if pace and image > 100:
+            time = 2 * image - 100 if image < 200 else 300 + (image - 200) / 4
+        position = 2.0 * config.position * 0.01 ** min(time / 500, 1.0)
+        share = 0.1 ** min(max(time - 100, 0) / 400, 1.0)
         colors = [config.sh_dc * share, config.sh_dc / 20 * share]
         others = [config.rotation * share, config.scale * share, config.opacity, *colors]
         expected = torch.tensor([position, *others]).double()
@@ -214,19 +218,6 @@ def test_a_change_of_pace_does_not_change_past_events():
         assert density_events(schedule) == sorted(wanted)
 
 
-def test_rates_follow_the_configurations_own_times():
-    config = ScheduleConfig(iterations=1_000, position_decay=500, pace=((100, 0.5), (200, 4.0)))
-    optimiser = OptimiserConfig()
-    schedule = Schedule(config)
-    # 100 images are the first 100 of the configuration, 100 more the next 200, and 4 are one of the rest.
-    assert schedule.iterations == 200 + 700 * 4
-    table = schedule.learning_rates(optimiser, extent=2.0).double()
-    for image, time in ((0, 0), (60, 60), (100, 100), (150, 200), (200, 300), (600, 400), (2_999, 999.75)):
-        fall = 0.01 ** min(time / 500, 1)
-        assert table[image + 1, 0] == pytest.approx(2.0 * optimiser.position * fall, rel=1e-6)
-        assert table[image + 1, 3] == pytest.approx(optimiser.opacity, rel=1e-6)
-
-
 @pytest.mark.parametrize("factor", [0.1, 5.0])
 def test_pending_steps_are_the_same_after_a_change_of_pace(factor):
     """Steps without a gradient on both sides of a change: dense Adam in float64, step by step."""
@@ -273,18 +264,3 @@ def test_every_phase_begins_at_its_own_time(pace):
                 phases_of(schedule, round(image) + shift)[1:]
                 == phases_of(plain, schedule.pace.time(round(image) + shift))[1:]
             )
-
-
-def test_pace_is_read_and_written(tmp_path):
-    config = load_config(None, ["--schedule.pace=[[16, 0.25], [40, 3]]"])
-    assert config.schedule.pace == ((16, 0.25), (40, 3.0))
-    save_config(config, tmp_path / "config.yaml")
-    assert load_config(tmp_path / "config.yaml") == config == from_dict(to_dict(config))
-
-
-def test_every_piece_of_the_final_drift_has_its_own_step_numbers():
-    """A change of pace cannot happen within a step's images, so it happens between two steps."""
-    schedule = Schedule(ScheduleConfig(iterations=100, batch_size=4, pace=((8, 0.5),)))
-    assert schedule.iterations == 56  # 8 + 92 / 2 = 54, in steps of 4
-    for begin, end in itertools.pairwise(range(0, 60, 4)):
-        assert schedule.pace.time(begin) < schedule.pace.time(end)
