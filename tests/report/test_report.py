@@ -14,11 +14,12 @@ import torch
 from blitzgs.capture.world import GEO, GEOCENTRIC, WorldFrame
 from blitzgs.cli import main
 from blitzgs.report.gather import MAX_POINTS
-from blitzgs.report.report import MAX_BYTES, compare, differences, labels, report
+from blitzgs.report.report import MAX_BYTES, compare, differences, fitted, labels, report
 from blitzgs.runs.evaluation import PARTS, Previews, preview_file
 from blitzgs.runs.folder import open_run
 from blitzgs.util.errors import kept_warnings
 from tests.browser import Browser, needs_chromium, wait_for
+from tests.helpers import refused
 from tests.training.tiny import OVERRIDES, as_flags, at_step, events_of, train, write_tiny_capture
 
 HOSTILE = "</script><img src=x onerror=\"document.title='hit'\">&amp;\u2028.jpg"
@@ -162,50 +163,21 @@ def test_an_unfinished_or_damaged_run_has_a_report(trained, tmp_path):
     assert any(str(file) in sentence and "damaged" in sentence for sentence in data["left_out"])
 
 
-def large_run(trained, folder, views, noise):
-    """Make a run with many held-out views, and pictures that hardly compress."""
-
-    def cameras(content):
-        first = content["cameras"][0]
-        content["cameras"] = [first | {"name": f"{k:05d}.jpg"} for k in range(2 * views)]
-        content["test"] = list(range(0, 2 * views, 2))
-        content["train"] = sorted(set(range(2 * views)) - set(content["test"]))
-        return content
-
-    def metrics(content):
-        rng = np.random.default_rng(0)
-        values = 20 + 10 * rng.random(views)
-        content["views"] = {
-            f"{2 * k:05d}.jpg": {
-                "psnr": value,
-                "ssim": value / 31,
-                "psnr_corrected": value + 1,
-                "lpips": 0.123456,
-            }
-            for k, value in enumerate(values.tolist())
-        }
-        return content
-
-    copied(trained, folder, cameras=cameras, metrics=metrics)
-    (previews,) = folder.glob("evaluation/*/previews")
-    indices = list(range(0, 2 * 16, 2))
-    (previews / "views.json").write_text(json.dumps(indices))
-    for index in indices:
-        for part in PARTS:
-            preview_file(previews, index, part).write_bytes(noise)
-    return folder
-
-
-def test_two_thousand_held_out_views_stay_below_ten_megabytes(trained, tmp_path):
-    noise = np.random.default_rng(0).bytes(250_000)
-    folder = large_run(trained, tmp_path / "run", 2000, noise)
-    text = report(folder, {"html": "x" * 4_000_000, "note": ""})
+def test_two_thousand_held_out_views_stay_below_ten_megabytes():
+    source = "x" * 333_333  # of a picture that hardly compresses, in base64
+    picture = {"name": "a", "note": "", "layers": [{"label": part, "src": source} for part in PARTS]}
+    rows = [[f"{k:05d}.jpg", *np.random.default_rng(k).random(4)] for k in range(2000)]
+    content = {"views": rows, "pictures": [picture] * 16, "left_out": ["Before."]}
+    text = fitted("a", ("parts.js", "report.js"), content, {"html": "x" * 4_000_000, "note": ""})
     data = data_of(text)
     assert len(text.encode()) <= MAX_BYTES == 10_000_000
-    assert len(data["views"]) == 2000 and len(data["cameras"]["points"]) == 4000
-    assert 0 < len(data["pictures"]) < 16
-    assert "The model in 3D is left out" in " ".join(data["left_out"])
-    assert "pictures are left out" in " ".join(data["left_out"])
+    assert len(data["views"]) == 2000 and 8 < len(data["pictures"]) < 11
+    assert data["left_out"] == [
+        "Before.",
+        "The model in 3D is left out to keep this file small.",
+        f"{16 - len(data['pictures'])} pictures are left out to keep this file small.",
+    ]
+    refused(ValueError, "without any picture", fitted, "a", (), content | {"views": "x" * MAX_BYTES})
 
 
 def test_long_curves_are_thinned_to_means(trained, tmp_path):
