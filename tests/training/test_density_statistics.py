@@ -17,8 +17,6 @@ from blitzgs.table.table import GaussianTable
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
 from tests.training import tiny
-from tests.training.test_offload import assert_same_run
-from tests.training.test_offload import train as train_street
 from tests.training.tiny import (
     HEIGHT,
     WIDTH,
@@ -36,7 +34,6 @@ QUIET = (
     "schedule.iterations=200", "schedule.densify_from=150", "schedule.densify_until=180",
     "schedule.sh_every=2", "model.antialiased=true",
 )  # fmt: skip
-STILL = [f"optimiser.{name}=0" for name in ("position", "sh_dc", "opacity", "scale", "rotation")]
 
 
 def make_trainer(folder, *overrides) -> Trainer:
@@ -133,24 +130,6 @@ def test_statistics_are_those_of_autograd(tmp_path, batch_size, resolution):
     trainer.close()
 
 
-@pytest.mark.parametrize("batch_size", [2, 4, 8])
-def test_statistics_do_not_depend_on_the_batch_size(tmp_path, batch_size):
-    """The gradients of each view's own loss are added up. The Gaussians do not move."""
-    tables = {}
-    for size in (1, batch_size):
-        trainer = make_trainer(tmp_path / str(size), f"schedule.batch_size={size}", *STILL)
-        # Two epochs over all views, with SH degrees that do not depend on the batch size.
-        trainer.state.schedule.sh_degree = lambda begin, limit: limit
-        take_steps(trainer, 16 // size)
-        tables[size] = trainer.state.table
-        trainer.close()
-    one, several = tables[1], tables[batch_size]
-    assert torch.equal(one["means"], several["means"]) and one["grad_sum"].max() > 0
-    assert torch.equal(one["grad_count"], several["grad_count"])
-    assert torch.equal(one["max_radii"], several["max_radii"])
-    torch.testing.assert_close(one["grad_sum"], several["grad_sum"], rtol=1e-5, atol=1e-9)
-
-
 RISING = ("schedule.resolution=[[2, 40]]", "schedule.iterations=60")
 
 
@@ -198,13 +177,6 @@ def test_a_run_resumes_exactly_while_its_resolution_is_lower(whole_run, tmp_path
     resumed = trained_in_parts(train, tmp_path, 30, *RISING)
     assert_same_table(resumed.state.table, whole.state.table)
     assert [event["t"] for event in events_of(tmp_path, "resolution")] == [0, 40]
-
-
-def test_gaussians_in_host_memory_are_those_that_the_lower_resolution_sees(tmp_path):
-    options = ("schedule.resolution=[[2, 30]]", "schedule.iterations=45", "lod.visible_threshold=0")
-    whole, _ = train_street(tmp_path / "whole", *options)
-    pooled, _ = train_street(tmp_path / "pooled", *options, "memory.resident_gb=0.0078")
-    assert_same_run(pooled, whole)
 
 
 def _train(ranks, folder):

@@ -25,8 +25,6 @@ from blitzgs.view.gate import centres_of
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.training import tiny
 from tests.training.tiny import (
-    OVERRIDES,
-    as_flags,
     assert_same_table,
     events_of,
     lose_view,
@@ -35,7 +33,6 @@ from tests.training.tiny import (
     stop_at,
     tiny_scene,
     trained_in_parts,
-    write_tiny_capture,
 )
 
 # The passes follow the density event at 40 and come at 70; the window ends at 60; the mask is cleared at 85.
@@ -205,18 +202,12 @@ def test_a_run_on_two_ranks_opens_the_gate_and_clears_the_mask(whole_run, tmp_pa
         assert psnr == pytest.approx(summary["psnr"], abs=0.5)
 
 
-def test_render_honours_the_gate(tmp_path):
-    write_tiny_capture(tmp_path / "capture")
-    out, flags = tmp_path / "run", as_flags("config=defaults", *OVERRIDES, *FLAGS)
-    data = ["--data", str(tmp_path / "capture"), "--out", str(out)]
-    assert main(["train", *data, "--schedule.scale=0.8", *flags]) == 0
-    arguments = ["--out", str(tmp_path / "images"), "--raw", "--device", "cpu"]
-    assert main(["render", str(out), *arguments]) == 0
-    (path,) = (tmp_path / "images").glob("*.npy")
-    model, cameras = blitzgs.open_run(out).model(), blitzgs.open_run(out).cameras()
+def test_render_honours_the_gate(whole_run, tmp_path):
+    folder, *_ = whole_run
+    assert main(["render", str(folder), "--out", str(tmp_path), "--raw", "--device", "cpu"]) == 0
+    model = blitzgs.open_run(folder).model()
     assert model.lod is not None
-    image = model.render(cameras.cameras[cameras.test[0]])
-    np.testing.assert_allclose(np.load(path), image.numpy(), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(np.load(tmp_path / "03.npy"), model.render(3).numpy(), rtol=0, atol=1e-5)
 
 
 def test_a_gate_that_no_training_view_has_is_not_applied_elsewhere(tmp_path, monkeypatch):
