@@ -88,7 +88,7 @@ def set_up(
     # index of a training view would then belong to other views.
     train_views = train_views_fingerprint(capture)
     same_views = restored is None or restored.progress.train_views in ("", train_views)
-    config = _continued(_resolved(config, capture, restored, same_views), restored, extend, folder)
+    config = _continued(_resolved(config, capture, restored, same_views), restored, extend)
     schedule = Schedule(config.schedule)
     if restored is None:
         table, progress = first_gaussians(config, capture, space, ranks, home)
@@ -174,11 +174,9 @@ def _resolved(config: Config, capture: Capture, restored: TrainedModel | None, s
     return with_pace_of(replace(config, model=model, schedule=schedule, loss=loss), saved)
 
 
-def _continued(config: Config, restored: TrainedModel | None, extend: float | None, folder: Path) -> Config:
+def _continued(config: Config, restored: TrainedModel | None, extend: float | None) -> Config:
     """Return the configuration to begin or continue a run with: `config`, or one with a longer schedule."""
     if restored is None:
-        if extend is not None:
-            raise FileNotFoundError(f"{folder} has no checkpoint: there is no finished run to extend")
         return config
     if extend is not None:
         # An interrupted extension may have left its schedule in the folder's configuration.
