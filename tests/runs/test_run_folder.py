@@ -21,7 +21,6 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply
 from blitzgs.runs import checkpoint, trained_model
 from blitzgs.runs.export import without_antialiasing
-from blitzgs.runs.resume import check_resumable
 from blitzgs.training.trainer import Trainer
 from tests.helpers import export_ply, refused, save_checkpoint
 from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene
@@ -230,18 +229,6 @@ def test_a_damaged_camera_file_says_what_to_do(copy, tmp_path, capsys):
         assert "cameras.json is damaged" in (message := capsys.readouterr().err) and "--data" in message
 
 
-def test_damaged_records_of_the_log_do_not_end_a_run(copy):
-    data, folder = copy
-    (manifest,) = (folder / "checkpoints").glob("*/manifest.json")
-    record = {"run": json.loads(manifest.read_text())["state"]["run"], "event": "densify", "t": 5}
-    with open(folder / "log.jsonl", "a") as log:
-        log.write(f"{json.dumps(record)}\n{'[' * 100_000}\n5\n")
-    assert blitzgs.open_run(folder).log()[-1] == record
-    (folder / "summary.json").unlink()
-    assert main(["train", "--out", str(folder), "--data", str(data), "--resume"]) == 0
-    assert (folder / "summary.json").exists()
-
-
 # The configuration in the checkpoint is used.
 
 
@@ -258,12 +245,6 @@ def test_eval_uses_the_configuration_of_the_checkpoint(copy, tmp_path, capsys, c
         assert main(["eval", str(folder), "--data", str(data), "--out", str(tmp_path / "out")]) == 0
     assert json.loads(capsys.readouterr().out)["psnr"] == expected
     assert any("the configuration in the checkpoint is used" in str(w.message) for w in caught)
-
-
-def test_what_a_resume_may_change(trained):
-    saved = trained_model.restore(trained[1], Ranks()).config
-    schedule = dataclasses.replace(saved.schedule, evaluate_every=7, checkpoint_every=9)
-    check_resumable(saved, dataclasses.replace(saved, schedule=schedule))
 
 
 @pytest.mark.parametrize(

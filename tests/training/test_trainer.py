@@ -240,7 +240,7 @@ def test_a_run_is_not_overwritten_nor_resumed_with_another_configuration(whole_r
     ):
         train(folder, "loss.ssim=0.3", resume=True)
     assert (folder / "config.yaml").read_bytes() == written
-    train(folder, "log.every=50", resume=True)
+    train(folder, "log.every=50", "schedule.evaluate_every=7", "schedule.checkpoint_every=9", resume=True)
 
 
 @pytest.mark.cuda
