@@ -234,6 +234,9 @@ def test_what_cannot_be_aligned_is_refused(trained, survey, tmp_path, failure):
     run = str(trained[1])
     assert "2 of 2 control points can be used, and 3 are needed" in failure("align", run, "--gcp", path)
     assert "0 of 8 photographs have a GPS position, and 3 are needed" in failure("align", run, "--gps")
+    world = ("--ply", tmp_path / "a.ply", "--coordinates", "world")
+    unknown = "has no geo.json, so its place in the world is unknown: use blitzgs align"
+    assert unknown in failure("export", run, *world)
     pytest.importorskip("pyproj")
     assert "EPSG:4326 has angles" in failure("align", run, "--crs", "EPSG:4326")
     with pytest.raises(SystemExit):

@@ -159,17 +159,6 @@ def test_too_large_an_image_is_said_to_lack_memory(trained):
     refused(MemoryError, match, run.model().render, camera)
 
 
-def test_render_and_export_need_no_photographs(copy, tmp_path):
-    data, folder = copy
-    shutil.rmtree(data)
-    shutil.rmtree(tmp_path / "gone", ignore_errors=True)
-    config = (folder / "config.yaml").read_text()
-    (folder / "config.yaml").write_text(config.replace("capture", "nowhere"))
-    assert main(["render", str(folder), "--split", "all", "--out", str(tmp_path / "out")]) == 0
-    assert len(list((tmp_path / "out").glob("*.png"))) == 8
-    assert main(["export", str(folder), "--ply", str(tmp_path / "m.ply")]) == 0
-
-
 @pytest.mark.parametrize("command", ["eval", "render"])
 def test_a_run_is_shown_with_another_pool_than_it_was_trained_with(copy, tmp_path, capsys, failure, command):
     data, folder = copy
@@ -184,14 +173,6 @@ def test_a_run_is_shown_with_another_pool_than_it_was_trained_with(copy, tmp_pat
         with pytest.raises(SystemExit):
             main([*arguments, "--resident-gb", wrong])
         assert f"--resident-gb: must be in [0, 1,000,000], got {wrong}" in capsys.readouterr().err
-
-
-def test_a_split_without_views_is_named(copy, tmp_path, capsys):
-    cameras = copy[1] / "cameras.json"
-    cameras.write_text(json.dumps(json.loads(cameras.read_text()) | {"test": []}))
-    assert main(["render", str(copy[1]), "--out", str(tmp_path / "out")]) == 1
-    assert "has no test views: choose another --split" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_lost_photograph_costs_its_view_alone(copy, capsys, failure):

@@ -9,11 +9,8 @@ import pytest
 import torch
 
 from blitzgs.config.files import ConfigError
-from blitzgs.frame.render import render_frame
 from blitzgs.ops.photometric import photometric_loss
-from blitzgs.ops.projection_types import Views
 from blitzgs.reference import render
-from blitzgs.table.table import GaussianTable
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
 from tests.training import tiny
@@ -147,29 +144,6 @@ def test_the_log_tells_the_resolution_and_the_measurements_have_all_of_it(whole_
     assert not events_of(tmp_path, "resolution")
     assert summary["psnr"] == pytest.approx(other["psnr"], abs=1.5) and summary["psnr"] != other["psnr"]
     assert list(steps_of(folder)) and trainer.loader.views_masked[1] == 7
-
-
-def test_a_step_renders_the_camera_of_the_reduced_photograph(tmp_path):
-    trainer = tiny.make_trainer(tmp_path, *RISING)
-    state, frames = trainer.state, []
-    forward = state.stepper.forward
-
-    def kept(*args, **named):
-        frames.append(forward(*args, **named)[0])
-        return forward(*args, **named)
-
-    state.stepper.forward = kept
-    untrained = GaussianTable({name: state.table[name].clone() for name in state.table})
-    state.start_clock()
-    take_steps(trainer, 1)
-    trainer.close()
-    (frame,), (view,) = frames, state.sampler.batch(0)
-    index = state.capture.train[view]
-    K = torch.from_numpy(state.capture.cameras[index].K).float()
-    K[:2] *= 0.5
-    views = Views(state.views.pick([index]).viewmats, K[None], WIDTH // 2, HEIGHT // 2)
-    expected = render_frame(untrained, views, frame.options).renders
-    assert torch.equal(frame.renders, expected) and expected.std() > 0.05
 
 
 def test_a_run_resumes_exactly_while_its_resolution_is_lower(whole_run, tmp_path):

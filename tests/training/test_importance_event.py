@@ -116,16 +116,6 @@ def test_the_population_is_reported(whole_run):
     assert x1 == x2 and low > top
 
 
-def test_ablations_keep_the_signals(tmp_path):
-    trainer, _ = train(tmp_path / "a", "population.pass1_keep=1", "population.pass2_mass=1")
-    events = pass_events(tmp_path / "a")
-    for name in ("pass_1", "pass_2"):
-        assert events[name]["gaussians"] == events[name]["before"]
-    assert PHI in trainer.state.table
-    off, _ = train(tmp_path / "b", "population.importance=false")
-    assert PHI not in off.state.table and not pass_events(tmp_path / "b")
-
-
 RELOCATION = ("population.strategy=relocation", "population.pass1_keep=1")
 
 
