@@ -181,41 +181,6 @@ def test_a_lost_photograph_ends_the_run_in_time(monkeypatch, late):
         assert at <= step < at + MAX_STEPS + late
 
 
-# What is written a step later on CUDA.
-
-
-@pytest.mark.parametrize("end", ["schedule", "signal", "photograph"])
-def test_records_that_are_written_a_step_later_are_the_same(tmp_path, monkeypatch, end):
-    found = []
-    for late in (False, True):
-        running = trainer(tmp_path / str(late), "schedule.iterations=50", "log.every=1")
-        running._writes_late = late
-        with monkeypatch.context() as patch:
-            if end == "signal":
-                at_step(patch, 33, lambda self: os.kill(os.getpid(), signal.SIGTERM))
-            elif end == "photograph":
-                get = running.loader.get
-
-                def lost(place, steps, get=get):
-                    if place == 33:
-                        raise FileNotFoundError("/photos/00.png")
-                    return get(place, steps)
-
-                patch.setattr(running.loader, "get", lost)
-            if end == "photograph":
-                with pytest.raises(PhotographError):
-                    running.train()
-            else:
-                running.train()
-        found.append(steps_of(tmp_path / str(late)))
-        assert [record["t"] for record in found[-1]] == list(range(1, 51 if end == "schedule" else 34))
-        for record in found[-1]:
-            # The run's name and what was measured.
-            for name in ("run", "images_per_second", "seconds", "memory_bytes"):
-                del record[name]
-    assert found[0] == found[1]
-
-
 # Photographs, disks and terminals that disappear.
 
 
