@@ -14,7 +14,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -243,14 +243,7 @@ def _reference() -> tuple[list[Tensor], ReferenceImage]:
     return leaves, render(*leaves, *_camera(0), _WIDTH, _HEIGHT, sh_degree=1)
 
 
-PROBES: dict[str, Callable[..., dict[str, Any]]] = {
-    "torch": torch_,
-    "library": library,
-    "render": render,
-    "exchange": exchange,
-    "nccl": nccl,
-    "disk": disk,
-}
+_PROBES = {probe.__name__: probe for probe in (torch_, library, render, exchange, nccl, disk)}
 
 if __name__ == "__main__":
-    print(json.dumps(PROBES[sys.argv[1]](*sys.argv[2:])))
+    print(json.dumps(_PROBES[sys.argv[1]](*sys.argv[2:])))

@@ -9,7 +9,7 @@ import itertools
 import json
 import re
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -149,12 +149,13 @@ def _renders(
 
 def _render_film(path: Path, opened: Rendered, film: Film, ranks: Ranks) -> None:
     """Render all frames; rank 0 writes them."""
-    with ExitStack() as stack:
-        append: Callable[[npt.NDArray[np.uint8]], None] | None = None
-        if ranks.rank == 0:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            append = stack.enter_context(new_film(path, film.width, film.height, film.fps))
-        report = stack.enter_context(image_progress("Rendering", ranks.rank == 0))
+    writes = ranks.rank == 0
+    if writes:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        new_film(path, film.width, film.height, film.fps) if writes else nullcontext() as append,
+        image_progress("Rendering", writes) as report,
+    ):
         for position, (_, render) in enumerate(_renders(opened, ranks, lambda _: 0), 1):
             if append is not None and render is not None:
                 append(to_uint8(render))

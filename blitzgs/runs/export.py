@@ -59,12 +59,10 @@ def export(
             coordinates are the capture's.
 
     Raises:
-        ValueError: `coordinates` has another value, or there is a value that cannot be shown.
+        ValueError: there is a value that cannot be shown.
         FileExistsError: the file or that of the offset is needed, and another program has one of its name.
         OSError: the file cannot be written, or is no regular file.
     """
-    if coordinates not in COORDINATES:
-        raise ValueError(f"coordinates must be one of {', '.join(COORDINATES)}, got {coordinates!r}")
     check_replaces(path, kind)
     offset = np.array(space.offset)
     farthest, middle = _measured(source, offset)

@@ -225,14 +225,6 @@ def test_a_folder_that_cannot_be_read_is_a_failed_checkpoint(tmp_path, monkeypat
         save_checkpoint(tmp_path, table(3), {}, ALONE)
 
 
-def test_bad_arguments(tmp_path):
-    with pytest.raises(ValueError, match="of one length"):
-        save_checkpoint(tmp_path, {"a": torch.zeros(2), "b": torch.zeros(3)}, {}, ALONE)
-    refused(ValueError, "keep must be at least 1", save_checkpoint, tmp_path, table(2), {}, ALONE, keep=0)
-    with pytest.raises(ValueError, match="column a has dtype torch.complex64"):
-        save_checkpoint(tmp_path, {"a": torch.zeros(2, dtype=torch.complex64)}, {}, ALONE)
-
-
 def _shard_of(whole, ranks, sizes):
     start = sum(sizes[: ranks.rank])
     return {name: column[start : start + sizes[ranks.rank]] for name, column in whole.items()}
