@@ -38,7 +38,7 @@ from blitzgs.view.look import MAX_PIXELS, Look, Mode
 from blitzgs.view.views import CameraLike, ViewSet, viewmat
 from blitzgs.view.visible import Subject, VisibleFinder
 from blitzgs.viewer.film import SUFFIX, Film, check_film, new_film, read_film
-from blitzgs.viewer.studio import Opened, box_of, open_model
+from blitzgs.viewer.studio import box_of, open_model
 
 # What may be written beside the colours.
 MEASURED: tuple[Mode, ...] = ("depth", "alpha")
@@ -247,7 +247,11 @@ class Rendered:
 def open_rendered(args: argparse.Namespace, film: Film | None, ranks: Ranks) -> Rendered:
     """Open the model, and choose the cameras. Collective."""
     if args.model.is_file():
-        opened = _open_ply(args, ranks)
+        if ranks.world_size > 1:
+            raise ValueError(f"{args.model}: one process renders a file: run render without torchrun")
+        if args.data is not None:
+            raise ValueError("--data needs the folder of a run: for a file, use --path or --cameras")
+        opened = open_model(args.model, ranks)
         subject, box = opened.subject, opened.exhibit.box
         stored, exposures = None, None
     else:
@@ -270,14 +274,6 @@ def open_rendered(args: argparse.Namespace, film: Film | None, ranks: Ranks) -> 
         raise ValueError(f"{args.model} has no cameras: use --path, --cameras or the folder of a run")
     inputs = stored.inputs if stored else []
     return Rendered(subject, box, cameras, range(len(cameras)), inputs, {})
-
-
-def _open_ply(args: argparse.Namespace, ranks: Ranks) -> Opened:
-    if ranks.world_size > 1:
-        raise ValueError(f"{args.model}: one process renders a file: run render without torchrun")
-    if args.data is not None:
-        raise ValueError("--data needs the folder of a run: for a file, use --path or --cameras")
-    return open_model(args.model, ranks)
 
 
 def _shared_box(table: GaussianTable, ranks: Ranks) -> npt.NDArray[np.float64]:

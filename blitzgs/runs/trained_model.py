@@ -152,7 +152,8 @@ def save(folder: Path, model: TrainedModel, ranks: Ranks, in_background: bool = 
     columns = {name: table[name] for name in table}
     # Ranks that share a memory all copy their parts into it.
     sharing = ranks.world_size if table.device.type == "cpu" or ranks.shares_gpu else 1
-    has_room = in_background and 2 * sharing * table.memory_bytes < _memory_left(table.device)
+    left = torch.cuda.mem_get_info(table.device)[0] if table.device.type == "cuda" else available_bytes()
+    has_room = in_background and 2 * sharing * table.memory_bytes < left
     if has_room:
         columns = {name: column.clone() for name, column in columns.items()}
     saving = checkpoint.Saving(folder / CHECKPOINTS, columns, state, ranks, keep, model.shared)
@@ -160,10 +161,6 @@ def save(folder: Path, model: TrainedModel, ranks: Ranks, in_background: bool = 
         with ranks.watchdog.working("writing a checkpoint"):
             saving.wait()
     return saving
-
-
-def _memory_left(device: torch.device) -> int:
-    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else available_bytes()
 
 
 def restore(

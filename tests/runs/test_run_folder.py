@@ -191,7 +191,7 @@ def test_a_lost_photograph_costs_its_view_alone(copy, capsys, failure):
     assert main([*resume, "--data.allow_missing=true"]) == 0
 
 
-def test_a_damaged_camera_file_says_what_to_do(copy, tmp_path, capsys):
+def test_a_damaged_camera_file_says_what_to_do(copy, tmp_path, failure):
     _, folder = copy
     content = json.loads((folder / "cameras.json").read_text())
     damages = ["", "{", '{"version": 2}', '{"version": 1, "cameras": [{}]}', "[]", "[" * 100_000]
@@ -206,8 +206,8 @@ def test_a_damaged_camera_file_says_what_to_do(copy, tmp_path, capsys):
     damages.append(json.dumps(content | {"test": [math.inf]}))
     for damage in damages:
         (folder / "cameras.json").write_text(damage)
-        assert main(["render", str(folder), "--out", str(tmp_path / "out")]) == 1
-        assert "cameras.json is damaged" in (message := capsys.readouterr().err) and "--data" in message
+        message = failure("render", folder, "--out", tmp_path / "out")
+        assert "cameras.json is damaged" in message and "--data" in message
 
 
 # The configuration in the checkpoint is used.
@@ -281,7 +281,7 @@ def test_no_flipped_bit_of_a_manifest_passes(tmp_path):
 # Exports.
 
 
-def test_georeferenced_models_are_exported_around_their_origin(trained, tmp_path, capsys):
+def test_georeferenced_models_are_exported_around_their_origin(trained, tmp_path, capsys, failure):
     model = blitzgs.open_run(trained[1]).model()
     far = dataclasses.replace(model, space=dataclasses.replace(model.space, offset=(5e5, 4.6e6, 120.0)))
     exported = export_ply(far, tmp_path / "far.ply")
@@ -306,8 +306,8 @@ def test_georeferenced_models_are_exported_around_their_origin(trained, tmp_path
     assert not (tmp_path / "c.ply.offset.json").exists()
     mine = tmp_path / "d.ply.offset.json"
     mine.write_text("mine")
-    assert main(["export", str(trained[1]), "--ply", str(tmp_path / "d.ply"), *flags]) == 1
-    assert "is not the offset of an exported model: choose another name" in capsys.readouterr().err
+    message = failure("export", trained[1], "--ply", tmp_path / "d.ply", *flags)
+    assert "is not the offset of an exported model: choose another name" in message
     assert main(["export", str(trained[1]), "--ply", str(tmp_path / "d.ply")]) == 0
     assert mine.read_text() == "mine"
 
