@@ -27,11 +27,18 @@ def density_events(schedule):
 @pytest.mark.parametrize("scale", [0.1, 0.25, 1 / 3, 1.0, 2.0])
 def test_one_field_scales_every_time(scale):
     config = ScheduleConfig(
-        iterations=3_000, densify_from=50, densify_until=1_500, densify_every=10, scale=scale
+        iterations=3_000,
+        densify_from=50,
+        densify_until=1_500,
+        densify_every=10,
+        size_prune_after=30,
+        scale=scale,
     )
     schedule = Schedule(config)
     assert density_events(schedule) == sorted({math.floor(t * scale + 1e-6) for t in range(50, 1_500, 10)})
     assert schedule.steps == math.floor(3_000 * scale + 1e-6)
+    pruned = math.floor(30 * scale + 1e-6)
+    assert not schedule.prunes_by_size(pruned) and schedule.prunes_by_size(pruned + 1)
 
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 2.0])
@@ -76,12 +83,6 @@ def test_sh_degree_grows_in_the_step_that_contains_the_event():
     ]  # fmt: skip
     # Where the degree practically never grows, the share of the first step is lost to rounding.
     assert Schedule(ScheduleConfig(sh_every=10**9)).sh_degree(0, 3) == 0
-
-
-def test_size_pruning_starts_after_its_time():
-    schedule = Schedule(ScheduleConfig(size_prune_after=3_000, scale=0.5))
-    assert not schedule.prunes_by_size(1_500)
-    assert schedule.prunes_by_size(1_501)
 
 
 @pytest.mark.parametrize("pace", [(), ((100, 0.5), (200, 4.0))])

@@ -169,23 +169,24 @@ def test_train_prints_the_block_before_it_trains_and_keeps_its_near_plane(data, 
 
 @pytest.mark.parametrize(
     ("limit", "cache_bytes", "budget"),
-    [("1000000\n", 800_000, 250_000), ("1000000\n", 300_000, 150_000), ("max\n", 300_000, 150_000)],
+    [
+        ("1000000\n", 800_000, 250_000),
+        ("1000000\n", 300_000, 150_000),
+        ("max\n", 300_000, 150_000),
+        (None, 10**9, 4096 * 250 // 2),
+    ],
 )
-def test_ranks_share_at_most_half_of_the_memory_of_a_container(
+def test_ranks_share_at_most_half_of_the_memory_of_a_container_or_host(
     capture, tmp_path, monkeypatch, limit, cache_bytes, budget
 ):
-    (tmp_path / "memory.max").write_text(limit)
+    if limit is not None:
+        (tmp_path / "memory.max").write_text(limit)
     monkeypatch.setattr(inputs, "_CONTAINER_LIMIT", tmp_path / "memory.max")
+    pages = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 500 if limit is None else 10**6}
+    monkeypatch.setattr(inputs.os, "sysconf", pages.__getitem__)
     config = tiny_config(f"data.path={capture}", f"data.cache_bytes={cache_bytes}")
     _, images = inputs.open_capture(config, Ranks(local_world_size=2))
     assert images.compressed.budget == budget and images.decoded.budget == budget // 4 + budget
-
-
-def test_without_a_container_the_memory_of_the_host_counts(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(inputs, "_CONTAINER_LIMIT", tmp_path / "missing")
-    monkeypatch.setattr(inputs.os, "sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 100}[name])
-    _, images = inputs.open_capture(tiny_config(f"data.path={capture}"), Ranks())
-    assert images.compressed.budget == 4096 * 50
 
 
 def test_ranks_whose_photographs_do_not_fit_get_a_hint(loaded, monkeypatch):
