@@ -153,10 +153,7 @@ class Schedule:
 
     def is_last_density_event(self, time: int) -> bool:
         """Tell whether no other density event follows that at `time`."""
-        first, every = self._config.densify_from, self._config.densify_every
-        # `time` is rounded down, so the next event is the first at `time + 1` or later.
-        following = math.ceil((self.pace.time(time + 1) - first) / every)
-        return first + following * every >= self._config.densify_until
+        return all(event.kind != "densify" for event in self.events(time + 1, self.iterations))
 
     def has_new_levels(self, begin: int) -> bool:
         """Tell whether levels follow footprints again before the step at [begin, begin + B)."""

@@ -248,11 +248,8 @@ def test_the_papers_configuration_has_the_papers_values():
     assert population.importance and population.phi
     assert (population.pass1_keep, population.pass2_mass, population.pass2_keep) == (0.7, 0.99, 1)
     assert population.gate_rate == 0.6
-    assert (population.max_gaussians, population.pixels_per_gaussian, population.min_observations) == (
-        0,
-        0,
-        1,
-    )
+    assert population.max_gaussians == population.pixels_per_gaussian == 0
+    assert population.min_observations == 1
     assert (loss.ssim, loss.scale) == (0.2, 10)
     assert not config.model.antialiased and config.model.sh_degree == 3
 
