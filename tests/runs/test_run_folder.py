@@ -21,9 +21,8 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.ply import read_ply
 from blitzgs.runs import checkpoint, trained_model
 from blitzgs.runs.export import without_antialiasing
-from blitzgs.training.trainer import Trainer
 from tests.helpers import export_ply, refused, save_checkpoint
-from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene
+from tests.training.tiny import OVERRIDES, as_flags, train
 
 
 @pytest.fixture
@@ -32,12 +31,6 @@ def copy(trained, tmp_path):
     shutil.copytree(trained[0], tmp_path / "data")
     shutil.copytree(trained[1], tmp_path / "run")
     return tmp_path / "data", tmp_path / "run"
-
-
-def antialiased_model(tmp_path):
-    config = tiny_config("model.antialiased=true", "schedule.scale=0.4")
-    Trainer(config, *tiny_scene(), tmp_path / "aa", Ranks()).train()
-    return blitzgs.open_run(tmp_path / "aa")
 
 
 def test_a_run_is_read_without_the_trainer(trained):
@@ -307,7 +300,8 @@ def test_georeferenced_models_are_exported_around_their_origin(trained, tmp_path
 
 
 def test_antialiased_models_are_marked_and_can_be_baked(tmp_path, capsys):
-    folder = antialiased_model(tmp_path)
+    train(tmp_path / "aa", "model.antialiased=true", "schedule.scale=0.4")
+    folder = blitzgs.open_run(tmp_path / "aa")
     model, stored = folder.model(), folder.cameras()
     assert main(["export", str(folder.path), "--ply", str(tmp_path / "aa.ply")]) == 0
     assert "comment SplatRenderMode: mip" in read_ply(tmp_path / "aa.ply").comments
@@ -318,8 +312,7 @@ def test_antialiased_models_are_marked_and_can_be_baked(tmp_path, capsys):
     classic = read_ply(tmp_path / "classic.ply")
     assert not any("SplatRenderMode" in comment for comment in classic.comments)
     # A viewer without antialiasing shows the baked model far closer to what was trained.
-    train = [stored.cameras[i] for i in stored.train]
-    baked = without_antialiasing(model, train)
+    baked = without_antialiasing(model, [stored.cameras[i] for i in stored.train])
     torch.testing.assert_close(classic.opacities, baked.opacities)
     errors = {"marked": 0.0, "baked": 0.0}
     for camera in stored.cameras:

@@ -17,16 +17,11 @@ from blitzgs.runs import log as run_log
 from blitzgs.runs.folder_checks import FolderError, check_room, check_writable, locked
 from blitzgs.runs.guard import LossGuard, NonFiniteError
 from blitzgs.runs.log import RunLog
-from blitzgs.runs.run_files import LOG
 from blitzgs.runs.trained_model import known_id
-from blitzgs.training.trainer import Trainer
 from blitzgs.util import progress
 from tests.distributed.rank_harness import all_fail
-from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene, write_tiny_capture
-
-
-def records(folder):
-    return [json.loads(line) for line in (folder / LOG).read_text().splitlines()]
+from tests.helpers import refused
+from tests.training.tiny import OVERRIDES, as_flags, make_trainer, read_log, write_tiny_capture
 
 
 def work_on(folder, monkeypatch, terminal):
@@ -50,7 +45,7 @@ def work_on(folder, monkeypatch, terminal):
 def test_a_terminal_shows_every_step_and_the_evaluation(tmp_path, monkeypatch, capsys):
     position, bars = work_on(tmp_path, monkeypatch, terminal=True)
     assert position == 3 and bars == [("loss 0.5000", 3), ("views measured", 2)]
-    assert [record["t"] for record in records(tmp_path)] == [3]
+    assert [record["t"] for record in read_log(tmp_path)] == [3]
 
 
 def test_the_bar_moves_now_and_then_and_to_its_end(tmp_path, monkeypatch, capsys):
@@ -84,7 +79,7 @@ def test_elsewhere_long_work_prints_a_line_now_and_then(tmp_path, monkeypatch, c
     monkeypatch.setattr(progress, "LINE_SECONDS", 0.0)
     work_on(tmp_path, monkeypatch, terminal=False)
     assert "1 of 2 views measured" in capsys.readouterr().out
-    assert [record["t"] for record in records(tmp_path)] == [3, 3]
+    assert [record["t"] for record in read_log(tmp_path)] == [3, 3]
 
 
 def test_other_ranks_show_nothing(monkeypatch, capsys):
@@ -114,7 +109,7 @@ def test_what_is_shown_is_a_running_mean_and_the_held_out_figure(tmp_path, monke
     assert "loss 0.4000  train 25.00 dB" in lines[1]
     assert "loss 0.1000  train 24.00 dB  held-out 22.50 dB" in lines[-2]
     assert "bad \\x1b[2J name" in lines[-1]
-    assert [record["psnr"] for record in records(tmp_path)[:2]] == [20.0, 30.0]  # each view's own
+    assert [record["psnr"] for record in read_log(tmp_path)[:2]] == [20.0, 30.0]  # each view's own
 
 
 class OnCuda:
@@ -139,8 +134,7 @@ class Sums:
 
 @pytest.fixture(scope="module")
 def frame(tmp_path_factory):
-    config = tiny_config("schedule.batch_size=2")
-    running = Trainer(config, *tiny_scene(), tmp_path_factory.mktemp("frame"), Ranks())
+    running = make_trainer(tmp_path_factory.mktemp("frame"), "schedule.batch_size=2")
     batch = running.loader.get(0, 1)
     rendered, *_ = running.state.stepper.forward(1, running.state.render_options, batch)
     running.close()
@@ -169,12 +163,11 @@ def test_the_guard_names_the_pixel_and_says_what_it_has_looked_at(frame):
     images = rendered.renders.clone()
     images[1, 7, 11, 2] = float("nan")
     bad = Sums(0, float("nan"), 0, 0)
-    with pytest.raises(NonFiniteError, match=r"op rasterize, output renders: view 'b', pixel \(11, 7\)"):
-        LossGuard().check(9, ("a", "b"), bad, table, rendered._replace(renders=images))
-    with pytest.raises(
-        NonFiniteError, match="projected Gaussians and images are finite: it comes from op photom"
+    for shown, text in (
+        (rendered._replace(renders=images), r"op rasterize, output renders: view 'b', pixel \(11, 7\)"),
+        (rendered, "projected Gaussians and images are finite: it comes from op photometric"),
     ):
-        LossGuard().check(9, ("a", "b"), bad, table, rendered)
+        refused(NonFiniteError, text, LossGuard().check, 9, ("a", "b"), bad, table, shown)
     # A step later, the message does not name data that no longer exist.
     guard, late = LossGuard(), rendered._replace(renders=OnCuda(rendered.renders))
     guard.check(9, ("a", "b"), bad, table, late)
@@ -203,14 +196,14 @@ ROOT = Path(__file__).parents[2]
 
 def test_a_folder_that_cannot_be_written_is_refused_at_once(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    with pytest.raises(FolderError, match=r"file/run cannot be written: rank 0 \(.*Not a directory"):
-        check_writable(tmp_path / "file" / "run", Ranks())
+    no_folder = r"file/run cannot be written: rank 0 \(.*Not a directory"
+    refused(FolderError, no_folder, check_writable, tmp_path / "file" / "run", Ranks())
     usage = type("Usage", (), {"free": 1000})
     monkeypatch.setattr("shutil.disk_usage", lambda path: usage)
-    with pytest.raises(FolderError, match=r"a checkpoint takes .* kB and 1.00 kB are free"):
-        Trainer(tiny_config(), *tiny_scene(), tmp_path / "run", Ranks())
+    full = r"a checkpoint takes .* kB and 1.00 kB are free"
+    refused(FolderError, full, make_trainer, tmp_path / "run")
     monkeypatch.undo()
-    table = Trainer(tiny_config(), *tiny_scene(), tmp_path / "run", Ranks()).state.table
+    table = make_trainer(tmp_path / "run").state.table
     with pytest.warns(UserWarning, match="two checkpoints of 9,000,000,000,000 Gaussians take"):
         check_room(tmp_path, table, Ranks(), 9_000_000_000_000)
     assert not list(tmp_path.rglob(".probe*"))
@@ -222,15 +215,14 @@ def test_a_folder_that_cannot_be_written_is_refused_at_once(tmp_path, monkeypatc
 @pytest.mark.parametrize("resume", [True, False])
 def test_files_of_other_programs_are_not_replaced(tmp_path, name, resume):
     (tmp_path / name).write_text("precious")
-    with pytest.raises(FileExistsError, match=f"has {name}, which a run would replace"):
-        Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks(), resume=resume)
+    replaced = f"has {name}, which a run would replace"
+    refused(FileExistsError, replaced, make_trainer, tmp_path, resume=resume)
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "precious")]
 
 
 def test_a_file_in_the_place_of_the_checkpoints_is_found_at_once(tmp_path):
     (tmp_path / "checkpoints").write_text("")
-    with pytest.raises(NotADirectoryError, match="checkpoints"):
-        Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks())
+    refused(NotADirectoryError, "checkpoints", make_trainer, tmp_path)
 
 
 def _check(ranks, folders):
