@@ -22,7 +22,16 @@ from blitzgs.cli.arguments import Commands, add_command, add_device, add_flags, 
 from blitzgs.cli.report import write_final_report
 from blitzgs.cli.sfm import understood_alone, with_poses
 from blitzgs.config.fields import Config
-from blitzgs.config.files import ConfigError, changed, default_recipe, load_config, recipe_path, to_dict
+from blitzgs.config.files import (
+    REMOVED,
+    ConfigError,
+    changed,
+    default_recipe,
+    flat,
+    load_config,
+    recipe_path,
+    to_dict,
+)
 from blitzgs.config.ranges import describe, describe_all, describe_page
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import run_files
@@ -102,6 +111,11 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     add_flags(parser, FLAGS, {"--extend": _EXTENSION, "--minutes": float})
     add_live_page(parser)
     add_device(parser, shares_gpus=True)
+    for field in (*flat(to_dict(Config())), *REMOVED):
+        parser.add_argument(
+            f"--{field}", dest="overrides", action="append", default=[], type=f"{field}={{}}".format,
+            help=argparse.SUPPRESS,
+        )  # fmt: skip
 
 
 def _add_helps(parser: argparse.ArgumentParser) -> None:
