@@ -56,8 +56,8 @@ def make_trainer(folder, *overrides, **how):
 
 
 def train(folder, *overrides, device="cpu", resume=False):
-    trainer = make_trainer(folder, *overrides, ranks=Ranks(device=torch.device(device)), resume=resume)
-    return trainer, trainer.train()
+    ranks = Ranks(device=torch.device(device))
+    return tiny.train(folder, *SETTINGS, *overrides, scene=street(), ranks=ranks, resume=resume)
 
 
 def assert_same_run(one, other):
