@@ -122,14 +122,6 @@ def test_ctrl_c_at_the_start_has_no_traceback(capture, tmp_path, moment):
     assert "Traceback" not in done.stderr and not (tmp_path / "r").exists()
 
 
-def test_a_field_takes_its_value_after_a_space(capsys):
-    flags = ["--data.downscale", "8", "--population.max_gaussians=5", "--seed=3", "--model.near", "1e-3"]
-    assert main(["train", "--config", "smoke", "--show-config", *flags]) == 0
-    config = json.loads(capsys.readouterr().out)
-    assert config["data"]["downscale"] == 8 and config["population"]["max_gaussians"] == 5
-    assert config["seed"] == 3 and config["model"]["near"] == 1e-3
-
-
 @pytest.mark.parametrize(
     ("arguments", "texts"),
     [

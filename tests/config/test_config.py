@@ -18,7 +18,6 @@ from blitzgs.config.files import (
     REMOVED,
     ConfigError,
     config_hash,
-    default_recipe,
     from_dict,
     load_config,
     recipe_names,
@@ -312,18 +311,21 @@ def test_every_recipe_has_a_name_and_can_be_loaded():
 
 
 @pytest.mark.parametrize(
-    ("device", "recipe"), [("cpu", "aerial_cpu"), ("cuda", "aerial"), ("cuda:1", "aerial")]
+    ("flags", "has_gpu", "recipe"),
+    [
+        (["--device", "cpu"], True, "aerial_cpu"),
+        (["--device", "cuda:1"], False, "aerial"),
+        ([], True, "aerial"),
+        ([], False, "aerial_cpu"),
+    ],
 )
-def test_a_run_without_a_configuration_gets_the_recipe_of_its_device(capsys, device, recipe):
-    config, said = shown(capsys, "--device", device)
+def test_a_run_without_a_configuration_gets_the_recipe_of_its_device(
+    capsys, monkeypatch, flags, has_gpu, recipe
+):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: has_gpu)
+    config, said = shown(capsys, *flags)
     assert config == to_dict(load_config(recipe_path(recipe)))
     assert f"recipe: {recipe} (choose another one with --config)" in said
-
-
-def test_the_recipe_follows_the_device_that_auto_finds(capsys, monkeypatch):
-    for has_gpu in (True, False):
-        monkeypatch.setattr(torch.cuda, "is_available", lambda has_gpu=has_gpu: has_gpu)
-        assert f"recipe: {default_recipe(has_gpu)} " in shown(capsys)[1]
 
 
 def test_names_files_and_the_defaults_of_fields(capsys, tmp_path):
