@@ -216,13 +216,10 @@ def test_a_folder_that_cannot_be_read_is_a_failed_checkpoint(tmp_path, monkeypat
         save_checkpoint(tmp_path, table(3), {}, ALONE)
 
 
-def _shard_of(whole, ranks, sizes):
-    start = sum(sizes[: ranks.rank])
-    return {name: column[start : start + sizes[ranks.rank]] for name, column in whole.items()}
-
-
 def _save_shard(ranks, directory, sizes):
-    return save_checkpoint(directory, _shard_of(table(sum(sizes)), ranks, sizes), {"m": 4}, ranks).name
+    begin, end = (sum(sizes[:rank]) for rank in (ranks.rank, ranks.rank + 1))
+    shard = {name: column[begin:end] for name, column in table(sum(sizes)).items()}
+    return save_checkpoint(directory, shard, {"m": 4}, ranks).name
 
 
 def _load_shard(ranks, directory):
