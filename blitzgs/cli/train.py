@@ -26,7 +26,6 @@ from blitzgs.config.files import (
     REMOVED,
     ConfigError,
     changed,
-    default_recipe,
     flat,
     load_config,
     recipe_path,
@@ -260,7 +259,7 @@ def _config(args: argparse.Namespace) -> Config:
     elif args.resume and own is not None and own.exists():
         source = own
     else:
-        recipe = default_recipe(_on_gpu(args))
+        recipe = "aerial" if _on_gpu(args) else "aerial_cpu"
         source = recipe_path(recipe)
         if os.environ.get("RANK", "0") == "0":  # torchrun's number of the process
             print(f"recipe: {recipe} (choose another one with --config)", file=sys.stderr)

@@ -183,7 +183,13 @@ def _read(path: Path, seen: set[Path]) -> dict[str, Any]:
         return values
     if not isinstance(base, str):
         raise ConfigError(f"{path}: base must be a file name or the name of a recipe, got {base!r}")
-    merged = _read(base_file(base, path), seen | {path})
+    # A file beside this one, or a recipe; a copy of a recipe's file names its base with ".yaml".
+    beside, problem = (
+        path.parent / base,
+        f"{path}: base: {base}: no such file in {path.parent} and no such recipe",
+    )
+    found = beside if beside.is_file() else _recipe(base.removesuffix(".yaml"), problem)
+    merged = _read(found, seen | {path})
     _merge(merged, values, str(path))
     return merged
 
@@ -316,16 +322,6 @@ def recipe_path(given: str) -> Path | None:
     return None if given == DEFAULTS else _recipe(given, f"{given}: no such file or recipe")
 
 
-def base_file(given: str, file: Path) -> Path:
-    """Return the file that `base` names in a configuration file: a path relative to it, or a recipe.
-
-    The name may end in ".yaml": a copy of a recipe's file names its base so.
-    """
-    beside = file.parent / given
-    problem = f"{file}: base: {given}: no such file in {file.parent} and no such recipe"
-    return beside if beside.is_file() else _recipe(given.removesuffix(".yaml"), problem)
-
-
 def _recipe(name: str, problem: str) -> Path:
     """Return the file of a recipe (ConfigError: there is none of this name; `problem` begins the message)."""
     files = (folder / f"{name}.yaml" for folder in _FOLDERS if "/" not in name)
@@ -335,8 +331,3 @@ def _recipe(name: str, problem: str) -> Path:
     close = difflib.get_close_matches(Path(name).stem, known, n=1)
     hint = f"did you mean '{close[0]}'? " if close else ""
     raise ConfigError(f"{problem}; {hint}recipes are {', '.join(known)}")
-
-
-def default_recipe(on_gpu: bool) -> str:
-    """Return the recipe of a run that names none."""
-    return "aerial" if on_gpu else "aerial_cpu"

@@ -45,7 +45,6 @@ from blitzgs.training.records import (
     write_picture,
 )
 from blitzgs.training.setup import set_up
-from blitzgs.training.state import never
 from blitzgs.training.understood import hints_of, largest_size
 from blitzgs.training.watching import Watching
 from blitzgs.util.errors import warn
@@ -125,7 +124,7 @@ class Trainer:
                 "leave damaged ones out with --data.allow_missing=true"
             ) from error
         finally:
-            state.stops = never
+            state.stops = lambda: False
             self.close()
 
     def _take_steps(self, agreement: Agreement) -> bool:
