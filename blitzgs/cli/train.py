@@ -50,6 +50,7 @@ from blitzgs.util.progress import Laps
 if TYPE_CHECKING:
     from blitzgs.viewer.live import Live
 
+_PORT = 8080
 # See `blitzgs.training.budget.extended`.
 _EXTENSION = number(
     float,
@@ -108,7 +109,16 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     parser = add_command(commands, "train", run, summary, HELP, add_help=False)
     _add_helps(parser)
     add_flags(parser, FLAGS, {"--extend": _EXTENSION, "--minutes": float})
-    add_live_page(parser)
+    parser.add_argument(
+        "--viewer",
+        type=int,
+        nargs="?",
+        const=_PORT,
+        metavar="PORT",
+        help=f"show the training in the browser (default port: {_PORT}); needs the extra view",
+    )
+    add_flags(parser, "--viewer-host HOST  address to listen on (default: %(default)s, this machine only)")
+    parser.set_defaults(viewer_host="127.0.0.1")
     add_device(parser, shares_gpus=True)
     for field in (*flat(to_dict(Config())), *REMOVED):
         parser.add_argument(
@@ -324,23 +334,6 @@ def _print_summary(summary: dict[str, object], folder: Path) -> None:
         *(f"  blitzgs {command:{width}}   {what}" for command, what in commands.items()),
     ):
         console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
-
-
-_PORT = 8080
-
-
-def add_live_page(parser: argparse.ArgumentParser) -> None:
-    """Add the flags."""
-    parser.add_argument(
-        "--viewer",
-        type=int,
-        nargs="?",
-        const=_PORT,
-        metavar="PORT",
-        help=f"show the training in the browser (default port: {_PORT}); needs the extra view",
-    )
-    add_flags(parser, "--viewer-host HOST  address to listen on (default: %(default)s, this machine only)")
-    parser.set_defaults(viewer_host="127.0.0.1")
 
 
 def live_page(state: TrainingState, port: int, host: str) -> Live | None:

@@ -19,7 +19,7 @@ from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs import checkpoint
-from blitzgs.runs.cameras import stored_exposures
+from blitzgs.runs.cameras import SHARED_EXPOSURES, effective_exposures
 from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.checkpoint_files import DAMAGE
 from blitzgs.runs.guard import bad_column, check_before_saving
@@ -113,7 +113,8 @@ class TrainedModel:
     @property
     def exposures(self) -> torch.Tensor | None:
         """Gain and bias of each training photograph, [T, 2, 3]; None if the run has none."""
-        return stored_exposures(self.shared)
+        found = self.shared.get(SHARED_EXPOSURES)
+        return None if found is None else effective_exposures(found[:, :-1].reshape(-1, 2, 3))
 
     def subject(self, ranks: Ranks) -> Subject:
         """Return what views are rendered from, on the ranks' device. Collective.
