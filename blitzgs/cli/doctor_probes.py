@@ -20,8 +20,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from blitzgs.reference.render import ReferenceImage
-
 
 REPORT = "report this with `blitzgs doctor --json`"
 REINSTALL = "pip install --force-reinstall --no-deps blitzgs (in a checkout: make build)"
@@ -105,11 +103,15 @@ def render(device: str) -> dict[str, Any]:
     """Render a small scene and differentiate it, and compare both with the float64 reference."""
     import torch
 
+    from blitzgs.reference.render import render as render_reference
+
     tensors = [tensor.to(device).requires_grad_() for tensor in _scene()]
     viewmat, K = (tensor.to(device) for tensor in _camera(0))
     begin = time.perf_counter()
     images = _rendered(tensors, viewmat, K, False)
-    leaves, reference = _reference()
+    leaves = [tensor.double().requires_grad_() for tensor in _scene()]
+    by_definition: Any = render_reference
+    reference = by_definition(*leaves, *_camera(0), _WIDTH, _HEIGHT, sh_degree=1)
     weights = torch.randn(reference.image.shape, generator=_generator(), dtype=torch.float64)
     weights[reference.cut] = 0  # where rounding decides whether a Gaussian counts
     (images[0].double().cpu() * weights).sum().backward()
@@ -233,14 +235,6 @@ def _rendered(scene: list[Tensor], viewmat: Tensor, K: Tensor, distributed: bool
     render: Any = blitzgs.rasterization
     view = (viewmat[None], K[None], _WIDTH, _HEIGHT)
     return render(*scene, *view, sh_degree=1, distributed=distributed)[0]
-
-
-def _reference() -> tuple[list[Tensor], ReferenceImage]:
-    from blitzgs.reference.render import render as render_reference
-
-    leaves = [tensor.double().requires_grad_() for tensor in _scene()]
-    render: Any = render_reference
-    return leaves, render(*leaves, *_camera(0), _WIDTH, _HEIGHT, sh_degree=1)
 
 
 _PROBES = {probe.__name__: probe for probe in (torch_, library, render, exchange, nccl, disk)}

@@ -246,7 +246,11 @@ def open_model(
     holds no checkpoint.
     """
     check_is_run(folder)
-    pool_bytes = int((_resident_gb(folder / CONFIG) if resident_gb is None else resident_gb) * 1e9)
+    if resident_gb is None:
+        resident_gb = 0.0
+        with suppress(ConfigError):
+            resident_gb = load_config(folder / CONFIG).memory.resident_gb
+    pool_bytes = int(resident_gb * 1e9)
     home = torch.device("cpu") if pool_bytes > 0 else ranks.device
     model = restore(folder, ranks, home, only)
     if model is None:
@@ -259,11 +263,3 @@ def open_model(
     optimiser = TableAdam(config.optimiser, Schedule(config.schedule), model.space.extent, home)
     optimiser.catch_up(model.table, None, model.progress.step)
     return model
-
-
-def _resident_gb(path: Path) -> float:
-    """Return how many gigabytes of a device the configuration gives to the Gaussians; 0: no limit."""
-    try:
-        return load_config(path).memory.resident_gb
-    except ConfigError:
-        return 0.0
