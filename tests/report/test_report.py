@@ -13,7 +13,7 @@ import torch
 
 from blitzgs.capture.world import GEO, GEOCENTRIC, WorldFrame
 from blitzgs.cli import main
-from blitzgs.report.gather import MAX_POINTS
+from blitzgs.report.gather import MAX_POINTS, _thinned
 from blitzgs.report.report import MAX_BYTES, compare, differences, fitted, labels, report
 from blitzgs.runs.evaluation import PARTS, Previews, preview_file
 from blitzgs.runs.folder import open_run
@@ -180,17 +180,10 @@ def test_two_thousand_held_out_views_stay_below_ten_megabytes():
     refused(ValueError, "without any picture", fitted, "a", (), content | {"views": "x" * MAX_BYTES})
 
 
-def test_long_curves_are_thinned_to_means(trained, tmp_path):
-    folder = copied(trained, tmp_path / "run")
-    run = open_run(folder).log()[0]["run"]
-    with open(folder / "log.jsonl", "a") as file:
-        for k in range(10_000):
-            file.write(
-                json.dumps({"t": 100 + k, "run": run, "loss": 0.5 + 0.1 * (-1) ** k, "seconds": k}) + "\n"
-            )
-    loss = data_of(report(folder))["curves"]["loss"]
-    assert len(loss) <= MAX_POINTS
-    assert [p[2] for p in loss[5:]] == pytest.approx([0.5] * len(loss[5:]), abs=0.01)
+def test_long_curves_are_thinned_to_means():
+    loss = _thinned([(k, float(k), 0.5 + 0.1 * (-1) ** k) for k in range(10_000)])
+    assert len(loss) <= MAX_POINTS and loss[-1][0] == 9_999
+    assert [p[2] for p in loss] == pytest.approx([0.5] * len(loss), abs=0.01)
 
 
 def test_only_pages_of_ours_are_replaced(trained, tmp_path, failure):
