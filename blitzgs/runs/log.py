@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The log of a run: a progress bar (or plain lines), a JSONL file and TensorBoard events.
 
-A failure to log never ends a run. If the disk is full or the terminal is closed, one warning is printed, and
-records are kept in memory to be written later.
+A failure to write never ends a run. If the disk is full, one warning is printed, and records are kept in
+memory to be written later. What is printed survives a closed terminal by `blitzgs.cli.output`.
 """
 
 from __future__ import annotations
@@ -165,8 +165,7 @@ class RunLog:
     def close(self) -> None:
         """Write remaining records and end the progress display."""
         if self._progress is not None:
-            with self._tolerated("terminal"):
-                self._progress.stop()
+            self._progress.stop()
         if self._board is not None:
             with self._tolerated("TensorBoard"):
                 self._board.close()
@@ -202,8 +201,7 @@ class RunLog:
                 self._board.add(t, values)
 
     def _print(self, text: str) -> None:
-        with self._tolerated("terminal"):
-            self.console.print(printable(text), soft_wrap=True, markup=False, emoji=False)
+        self.console.print(printable(text), soft_wrap=True, markup=False, emoji=False)
 
     @contextlib.contextmanager
     def _tolerated(self, kind: str) -> Iterator[None]:

@@ -6,10 +6,8 @@ import itertools
 import json
 import os
 import signal
-import sys
 import threading
 import time
-import warnings
 from pathlib import Path
 
 import pytest
@@ -327,23 +325,6 @@ def test_a_log_of_another_run_or_with_damaged_records_ends_nothing(tmp_path, mon
     assert trainer(tmp_path / "second", "schedule.iterations=50").train() is not None
     pictures = [(tmp_path / name / "trajectory.svg").read_text() for name in ("clean", "second")]
     assert pictures[0] == pictures[1]
-
-
-def test_a_terminal_that_is_gone_ends_nothing(tmp_path, monkeypatch):
-    class Gone:
-        encoding = "utf-8"
-
-        def write(self, text):
-            raise OSError(errno.EIO, "Input/output error")
-
-        flush = write
-        isatty = staticmethod(lambda: False)
-
-    running = trainer(tmp_path, SHORT)
-    monkeypatch.setattr(sys, "stdout", Gone())
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        assert running.train() is not None
 
 
 # Resuming says what it does, and the log holds every record once.
