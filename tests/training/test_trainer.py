@@ -39,13 +39,11 @@ def test_training_improves_the_images(whole_run, tmp_path):
     _, start = train(tmp_path, "schedule.iterations=1")
     assert summary["psnr"] > start["psnr"] + 3
     assert summary["ssim"] > start["ssim"]
-    assert summary["gaussians"] == len(trainer.state.table)
-    assert trainer.state.progress.sh_degree == 3
-    assert trainer.state.table["birth"].max() > 0
 
 
 def test_what_a_run_leaves_behind(whole_run):
     folder, trainer, summary = whole_run
+    assert trainer.state.progress.sh_degree == 3 and trainer.state.table["birth"].max() > 0
     assert json.loads((folder / "summary.json").read_text()) == summary
     figures = ("psnr", "ssim", "seconds", "images_per_second", "peak_memory_bytes", "config_hash", "versions")
     assert all(summary[name] for name in figures)
