@@ -71,7 +71,9 @@ class RunLog:
         self._failed: set[str] = set()  # kinds of logs of which a failure was told
         self._file = None if folder is None else folder / LOG
         self._waiting: deque[bytes] = deque(maxlen=_MAX_WAITING)  # lines that are not in the file yet
-        self._board: _Board | None = None
+        self._board: Path | None = None  # folder of TensorBoard's events
+        self._writer: Any = None  # of these events
+        self._done = done
         self._progress: Progress | None = None
         self._task = TaskID(0)
         self._moved = 0.0
@@ -87,7 +89,7 @@ class RunLog:
             folder.mkdir(parents=True, exist_ok=True)
             _drop_repeated(folder / LOG, run_id, done, total)
         if tensorboard and find_spec("tensorboard") is not None:
-            self._board = _Board(folder / BOARD, done)
+            self._board = folder / BOARD
         if self.console.is_terminal:
             bar = [BarColumn(bar_width=8)] if self.console.width >= 60 else []
             self._progress = Progress(
@@ -166,9 +168,9 @@ class RunLog:
         """Write remaining records and end the progress display."""
         if self._progress is not None:
             self._progress.stop()
-        if self._board is not None:
+        if self._writer is not None:
             with self._tolerated("TensorBoard"):
-                self._board.close()
+                self._writer.close()
         self._flush()
         self._file = None
 
@@ -196,9 +198,19 @@ class RunLog:
                 self._waiting.popleft()
 
     def _draw(self, t: int, values: Mapping[str, float]) -> None:
-        if self._board is not None:
-            with self._tolerated("TensorBoard"):
-                self._board.add(t, values)
+        """Add numbers to TensorBoard's events."""
+        if self._board is None:
+            return
+        with self._tolerated("TensorBoard"):
+            from torch.utils.tensorboard import SummaryWriter
+
+            # Drop the steps after `done` that an interrupted run has logged: they will be logged again.
+            purge = self._done + 1 if self._done else None
+            writer = self._writer or SummaryWriter(str(self._board), purge_step=purge)
+            self._writer = None  # after an error its thread has ended, and the next record makes a new one
+            for name, value in values.items():
+                writer.add_scalar(name, value, t)
+            self._writer = writer
 
     def _print(self, text: str) -> None:
         self.console.print(printable(text), soft_wrap=True, markup=False, emoji=False)
@@ -213,29 +225,6 @@ class RunLog:
                 self._failed.add(kind)
                 with contextlib.suppress(OSError):
                     warn(f"{kind}: {error}; training goes on, records may be missing there")
-
-
-class _Board:
-    """TensorBoard's events."""
-
-    def __init__(self, folder: Path, done: int) -> None:
-        self._folder, self._done = folder, done
-        self._writer: Any = None
-
-    def add(self, t: int, values: Mapping[str, float]) -> None:
-        from torch.utils.tensorboard import SummaryWriter
-
-        # Drop the steps after `done` that an interrupted run has logged: they will be logged again.
-        purge = self._done + 1 if self._done else None
-        writer = self._writer or SummaryWriter(str(self._folder), purge_step=purge)
-        self._writer = None  # after an error its thread has ended, and the next record makes a new one
-        for name, value in values.items():
-            writer.add_scalar(name, value, t)
-        self._writer = writer
-
-    def close(self) -> None:
-        if self._writer is not None:
-            self._writer.close()
 
 
 def records(path: Path) -> Iterator[dict[str, Any]]:

@@ -156,9 +156,6 @@ def test_wrong_flags_are_named(trained, whole, tmp_path, failure):
     ply = ["--ply", str(tmp_path / "a.ply")]
     for model, flags, reason in (
         (trained[1], [*ply, "--crop", *"000100"], "--crop takes the least"),
-        (trained[1], [*ply, "--min-opacity", "2"], "--min-opacity must be"),
-        (trained[1], [*ply, "--most", "0"], "--most must be"),
-        (trained[1], [*ply, "--clean", "0"], "--clean must be"),
         (trained[1], [*ply, "--crop-axes", "xz"], "is for --crop-polygon"),
         (trained[1], [*ply, "--levels", "0-1"], "no octree levels"),
         (trained[1], ["--spz", str(tmp_path / "a.ply")], "ends in .spz"),

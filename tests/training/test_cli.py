@@ -120,6 +120,8 @@ def test_torchrun_entry(trained, tmp_path):
         ("eval /nowhere", 1, "/nowhere is not a run"),
         ("eval /nowhere --pictures=-3", 1, "--pictures: must be 0 or more, got -3"),
         ("export /nowhere --ply x.ply", 1, "/nowhere is not a run"),
+        ("export x --ply x.ply --most 0", 2, "--most: must be a whole number from 1 on, got 0"),
+        ("export x --ply x.ply --min-opacity=1", 2, "--min-opacity: must be from 0 to below 1, got 1"),
         ("train --data d --out x --device tpu", 1, "cuda or cuda:N, got 'tpu'"),
         ("train --data d --out ''", 2, "argument --out: the path is empty"),
         ("eval ''", 2, "argument MODEL: the path is empty"),
