@@ -46,6 +46,7 @@ FLAGS = """
     [1, 3, H, W] in [-1, 1], and returns their distance
 --allow-missing  leave out views whose photograph is missing
 """
+_COUNT = arguments.number(int, lambda value: value >= 0, "0 or more")
 _FACTOR = arguments.number(int, lambda value: value >= 1, "a whole number from 1 on")
 
 
@@ -57,14 +58,12 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
     arguments.add_device(parser, shares_gpus=True)
     arguments.add_pool(parser)
     arguments.add_split(parser, "measure")
-    arguments.add_flags(parser, FLAGS, {"--downscale": _FACTOR, "--pictures": int, "--lpips": str})
+    arguments.add_flags(parser, FLAGS, {"--downscale": _FACTOR, "--pictures": _COUNT, "--lpips": str})
     parser.set_defaults(pictures=8)
 
 
 def run(args: argparse.Namespace) -> None:
     """Measure the views of a run."""
-    if args.pictures < 0:
-        raise ValueError(f"--pictures: must be 0 or more, got {args.pictures}")
     with Ranks.from_environment(args.device, share_gpus=args.share_gpus) as ranks:
         path: Path = args.model
         if path.is_file():

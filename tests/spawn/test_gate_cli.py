@@ -253,8 +253,6 @@ def test_what_is_missing_is_named(tmp_path, capsys, failure):
     assert "holds no lineage: train with --population.lineage=true" in capsys.readouterr().err
     assert main(["gate", "fit", str(tmp_path / "no"), "--out", str(tmp_path / "g.json")]) == 1
     assert "no is not the folder of a run" in capsys.readouterr().err
-    assert main(["gate", "fit", str(tmp_path), "--gate-from=nan", "--out", str(tmp_path / "g.json")]) == 1
-    assert "--gate-from: must be 0 or more, got nan" in capsys.readouterr().err
     assert "a gate's file ends in .json" in failure("gate", "fit", tmp_path, "--out", tmp_path / "g.txt")
     assert main(["gate", "evaluate", str(tmp_path / "g.json"), "x", "--out", str(tmp_path)]) == 1
     assert "g.json: no such gate; `blitzgs gate fit` makes one" in capsys.readouterr().err
