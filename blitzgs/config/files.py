@@ -23,9 +23,8 @@ from blitzgs.config.ranges import flat as flat
 from blitzgs.config.ranges import problems
 from blitzgs.util.output import write_file
 
-
-class Ignored:
-    """Marks a removed field whose values have no effect any more."""
+# Marks a removed field whose values have no effect any more.
+IGNORED = object()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,8 +42,8 @@ class Share:
 # Fields of earlier versions, each with the value that stands for what BlitzGS does now. Files and checkpoints
 # that have this value are still read.
 REMOVED: Mapping[str, Any] = {
-    "data.threads": Ignored(),
-    "data.prefetch": Ignored(),
+    "data.threads": IGNORED,
+    "data.prefetch": IGNORED,
     "model.far": 1e6,
     "model.eps2d": 0.3,
     "model.initial_opacity": 0.1,
@@ -52,7 +51,7 @@ REMOVED: Mapping[str, Any] = {
     "lod.base_resolution": 0.001,
     "lod.fork": FORK,
     "schedule.adaptive": False,
-    "schedule.adaptive_limit": Ignored(),
+    "schedule.adaptive_limit": IGNORED,
     "schedule.placed": [],
     "schedule.levels_until": 0,
     "optimiser.final_share": 1.0,
@@ -64,19 +63,19 @@ REMOVED: Mapping[str, Any] = {
     "optimiser.sh_rest": Share("optimiser.sh_dc", SH_SHARE),
     "loss.size": 0.0,
     "population.absolute_gradients": False,
-    "population.absolute_threshold": Ignored(),
+    "population.absolute_threshold": IGNORED,
     "population.relocate": False,
     "population.opacity_decay": 0.0,
     "population.reset_opacity": 0.01,
-    "view.first_levels": Ignored(),
+    "view.first_levels": IGNORED,
     "view.most_kept": 0.8,
-    "view.level_ratio": Ignored(),
+    "view.level_ratio": IGNORED,
     "view.smooth": False,
     "ranks.half_exchange": False,
-    "ranks.max_imbalance": Ignored(),
-    "ranks.share_gpus": Ignored(),
-    "log.pictures": Ignored(),
-    "log.lpips_weights": Ignored(),
+    "ranks.max_imbalance": IGNORED,
+    "ranks.share_gpus": IGNORED,
+    "log.pictures": IGNORED,
+    "log.lpips_weights": IGNORED,
 }
 
 
@@ -251,7 +250,7 @@ def without_effect(name: str, value: Any, values: Mapping[str, Any]) -> bool:
         whole = values.get(known.field, flat(to_dict(Config()))[known.field])
         return math.isclose(_convert(float, value, name), known.share * _convert(float, whole, known.field))
     found = _convert(float, value, name) if isinstance(known, float) else value
-    return isinstance(known, Ignored) or bool(found == known)
+    return known is IGNORED or bool(found == known)
 
 
 def _hint(name: str, known: list[str]) -> str:

@@ -175,8 +175,7 @@ def peak_memory_bytes(device: torch.device) -> int:
 def memory_bytes(device: torch.device) -> int:
     """Return this process's memory in bytes now: allocated on a GPU, or resident on the CPU."""
     if device.type == "cuda":
-        # torch.cuda.memory_allocated reads the same, but copies all figures of the allocator first.
-        return int(torch.cuda.memory_stats_as_nested_dict(device)["allocated_bytes"]["all"]["current"])
+        return torch.cuda.memory_allocated(device)
     return int(psutil.Process().memory_info().rss)
 
 

@@ -25,7 +25,7 @@ from blitzgs.config.files import (
     save_config,
     to_dict,
 )
-from blitzgs.config.ranges import RANGES, _entries, describe, describe_all, flat, problems
+from blitzgs.config.ranges import RANGES, describe, describe_all, flat, problems
 from blitzgs.config.schedule import Schedule
 from blitzgs.optim.table_adam import BETA1, BETA2, EPS
 from tests.helpers import refused
@@ -280,12 +280,6 @@ def test_every_field_is_explained(name, explained):
     # The flag that is shown sets the default.
     assert load_config(None, [head.split("   (")[0]]) == Config()
     assert head in explained
-
-
-def test_no_field_that_is_gone_is_explained():
-    sections = ["", *{name.partition(".")[0] for name in FIELDS if "." in name}]
-    explained = [name for section in sections for names in _entries(section) for name in names]
-    assert sorted(explained) == sorted(FIELDS)
 
 
 def test_the_page_of_the_configuration_is_up_to_date(capsys):
