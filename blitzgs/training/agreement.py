@@ -77,11 +77,6 @@ class SaveClock:
         """Tell whether the time has passed."""
         return self.saving is None and time.monotonic() >= self._at
 
-    @property
-    def is_written(self) -> bool:
-        """Tell whether this rank has written its part of a checkpoint."""
-        return self.saving is not None and self.saving.is_written
-
 
 @dataclass(frozen=True)
 class Decision:
@@ -121,7 +116,8 @@ class Agreement:
         seconds = MAX_SECONDS
         if self._last is not None and step > self._last[0]:
             seconds = (now - self._last[1]) / (step - self._last[0])
-        requests = [self._stop.number, clock.is_due, not clock.is_written, lost, self._wants(), seconds]
+        unfinished = clock.saving is None or not clock.saving.is_written
+        requests = [self._stop.number, clock.is_due, unfinished, lost, self._wants(), seconds]
         if ranks.world_size > 1:
             values = to_device(torch.tensor(requests, dtype=torch.float64), ranks.device)
             with ranks.watchdog.waiting("agree"):

@@ -266,7 +266,7 @@ def config_of(*overrides):
     return load_config(None, overrides)
 
 
-def test_the_memory_of_a_known_population(loaded):
+def test_the_memory_of_a_known_population_and_the_minutes(loaded):
     found = estimate(config_of("population.max_gaussians=400", "schedule.batch_size=2"), loaded, True, 2)
     row = 3 * 59 * 4 + 42 + 180 + 500  # 59 parameters with two moments, and the widest column once more
     assert found.gaussians == 400
@@ -278,12 +278,9 @@ def test_the_memory_of_a_known_population(loaded):
     on_cpu = estimate(config_of("population.max_gaussians=400", "schedule.batch_size=2"), loaded, False, 2)
     assert on_cpu.device_bytes == 0
     assert on_cpu.host_bytes == 400_000_000 + 3 * VIEWS * WIDTH * HEIGHT + found.device_bytes
-
-
-def test_minutes_are_those_that_were_asked_for(loaded):
+    minutes = [estimate(config_of(), loaded, False, cores).minutes for cores in (1, 4)]
+    assert minutes[0] == pytest.approx(4 * minutes[1])
     assert estimate(config_of("schedule.minutes=7"), loaded, False, 2).minutes == 7
-    one, four = (estimate(config_of(), loaded, False, cores).minutes for cores in (1, 4))
-    assert one == pytest.approx(4 * four)
 
 
 def test_growth_ends_at_the_limit_and_its_mean_is_over_images():

@@ -55,17 +55,14 @@ class Recorder:
         self.closed += 1
 
 
-def some_look(state, mode="RGB"):
-    camera = state.capture.cameras[0]
-    return Look(viewmat(camera, state.space), camera.K, camera.width, camera.height, mode=mode)
-
-
 STEPS = "schedule.iterations=40"
 
 
 def watched_run(folder, *overrides, ranks=None, **choices):
     trainer = make_trainer(folder, STEPS, *overrides, ranks=ranks)
-    watcher = Recorder(some_look(trainer.state), **choices)
+    camera = trainer.state.capture.cameras[0]
+    look = Look(viewmat(camera, trainer.state.space), camera.K, camera.width, camera.height)
+    watcher = Recorder(look, **choices)
     trainer.watch(watcher if ranks is None or ranks.rank == 0 else None)
     return trainer, watcher, trainer.train()
 
