@@ -35,7 +35,7 @@ def scene(scale=1.0):
 
 
 def make(points, colors, centres, threshold=0.5):
-    levels = measure_levels(points, centres, 2.0, 0.01)
+    levels = measure_levels(points, centres, 2.0)
     return levels, octree_gaussians(points, colors, centres, levels, threshold).table(2, 0.1)
 
 
@@ -98,7 +98,7 @@ def test_a_stray_point_does_not_spoil_the_grid():
     points, colors, centres = scene()
     _, table = make(points, colors, centres)
     stray = torch.cat((points, torch.full((1, 3), -1e9, dtype=torch.float64)))
-    levels = measure_levels(points, centres, 2.0, 0.01)
+    levels = measure_levels(points, centres, 2.0)
     spoilt = octree_gaussians(stray, torch.cat((colors, colors[:1])), centres, levels, 0.5).table(2, 0.1)
     assert abs(len(spoilt) - len(table)) < 0.1 * len(table)
     assert spoilt["means"].abs().max() < 10
@@ -115,7 +115,7 @@ def test_one_point():
 
 def test_parts_of_the_first_gaussians_are_rows_of_the_whole_table():
     points, colors, centres = scene()
-    first = octree_gaussians(points, colors, centres, measure_levels(points, centres, 2.0, 0.01), 0.5)
+    first = octree_gaussians(points, colors, centres, measure_levels(points, centres, 2.0), 0.5)
     whole, parts = first.table(1, 0.1), [first.table(1, 0.1, part=slice(rank, None, 3)) for rank in range(3)]
     for rank, part in enumerate(parts):
         for name in whole:

@@ -208,7 +208,7 @@ def test_levels_and_visible_voxels_are_those_of_all_distances(monkeypatch, pairs
     monkeypatch.setattr("blitzgs.view.levels._PAIRS", pairs)
     points, centres = flat_scene(count, cameras, seed=count)
     distances = np.linalg.norm(points.numpy()[None] - centres.numpy()[:, None], axis=2)
-    levels = measure_levels(points, centres, 2.0, 0.001)
+    levels = measure_levels(points, centres, 2.0)
     d_max = np.quantile(np.quantile(distances, 0.999, axis=1), 0.999)
     assert levels.reference_distance == pytest.approx(d_max, rel=1e-12)
     d_min = np.quantile(np.quantile(distances, 0.001, axis=1), 0.001)

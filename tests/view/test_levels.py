@@ -35,7 +35,7 @@ def test_matches_numpy_quantiles(fork):
     d_min = np.quantile(np.quantile(distances, 0.001, axis=1), 0.001)
     box = 1.1 * (np.quantile(points, 0.99, axis=0) - np.quantile(points, 0.01, axis=0)).max()
     count = max(1, round(math.log(d_max / d_min) / math.log(fork)) + 1)
-    levels = measure_levels(*cloud(), fork, 0.001)
+    levels = measure_levels(*cloud(), fork)
     assert levels.count == count
     assert levels.reference_distance == pytest.approx(d_max, rel=1e-12)
     assert levels.voxel_size == pytest.approx(box / fork ** (10 - count // 2 + 1), rel=1e-12)
@@ -44,8 +44,8 @@ def test_matches_numpy_quantiles(fork):
 def test_scales_with_the_world_exactly():
     points, centres = cloud()
     levels, scaled = (
-        measure_levels(points, centres, 2.0, 0.001),
-        measure_levels(points * 64, centres * 64, 2.0, 0.001),
+        measure_levels(points, centres, 2.0),
+        measure_levels(points * 64, centres * 64, 2.0),
     )
     assert scaled == Levels(levels.count, 2.0, levels.reference_distance * 64, levels.voxel_size * 64)
 
@@ -70,9 +70,9 @@ def test_farthest_is_where_eq_1_still_rounds_up_to_the_level():
 
 def test_degenerate_input_is_refused():
     points, centres = cloud(10)
-    refused(ValueError, "got 0 points and 30 cameras", measure_levels, points[:0], centres, 2.0, 0.001)
+    refused(ValueError, "got 0 points and 30 cameras", measure_levels, points[:0], centres, 2.0)
     with pytest.raises(ValueError, match="spread out, .* measures 0, .* Check the points of the capture"):
-        measure_levels(points[:1].repeat(5, 1), centres, 2.0, 0.001)
+        measure_levels(points[:1].repeat(5, 1), centres, 2.0)
 
 
 def test_levels_of_footprints_leave_out_only_what_is_too_small_and_most_of_that():
