@@ -37,15 +37,9 @@ def environment(device: torch.device | str = "cpu") -> dict[str, Any]:
     if torch.device(device).type == "cuda":
         info["device"] = torch.cuda.get_device_name(device)
         info["cuda"] = str(torch.version.cuda)
-    if (version := gsplat_version()) is not None:
-        info["gsplat"] = version
+    if (gsplat := sys.modules.get("gsplat")) is not None:
+        info["gsplat"] = str(getattr(gsplat, "__version__", "of unknown version"))
     return info
-
-
-def gsplat_version() -> str | None:
-    """Return the version of gsplat; None if this process has not imported it."""
-    module = sys.modules.get("gsplat")
-    return None if module is None else str(getattr(module, "__version__", "of unknown version"))
 
 
 def commit() -> str:
