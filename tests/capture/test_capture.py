@@ -13,6 +13,7 @@ from blitzgs.capture.cameras import camera_centres
 from blitzgs.capture.capture import load_capture
 from blitzgs.capture.image_files import ImageHeader, apply_orientation, read_header
 from blitzgs.capture.images import ImageStore
+from blitzgs.capture.lengths import NEAR_OF_EXTENT
 from tests.capture.helpers import edit_model, shared_data, smooth_image, warned, write_capture, write_image
 from tests.helpers import refused
 
@@ -53,6 +54,7 @@ def test_views_are_sorted_and_every_eighth_is_held_out(tmp_path):
     train = camera_centres(np.stack([capture.cameras[i].world_to_camera for i in capture.train]))
     distances = np.linalg.norm(train - train.mean(axis=0), axis=1)
     assert capture.extent == pytest.approx(1.1 * distances.max())
+    assert capture.near == NEAR_OF_EXTENT * capture.extent
     assert capture.track_lengths.tolist()[0] == 9 and (capture.errors == -1).all()
 
 

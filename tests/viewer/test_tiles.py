@@ -8,7 +8,7 @@ import threading
 import numpy as np
 import pytest
 
-from blitzgs.capture.world import WorldFrame, enu_frame
+from blitzgs.capture.world import WorldFrame, enu_frame, geodetic
 from blitzgs.cli import main
 from blitzgs.cli.view import tiles_server
 from blitzgs.distributed.group import Ranks
@@ -193,19 +193,6 @@ def test_a_file_is_written_as_tiles_and_flags_choose(tmp_path, capsys, failure):
     (tmp_path / "cut.ply").write_bytes((tmp_path / "m.ply").read_bytes()[:-100])
     assert main(["export", str(tmp_path / "cut.ply"), "--tiles", str(tmp_path / "u")]) == 1
     assert "cut.ply" in capsys.readouterr().err and not (tmp_path / "u").exists()
-
-
-def geodetic(globe):
-    """Return latitude, longitude (degrees) and height of EPSG:4978 coordinates, by iteration."""
-    x, y, z = globe
-    a, f = 6378137.0, 1 / 298.257223563
-    e2, p = f * (2 - f), np.hypot(x, y)
-    latitude = np.arctan2(z, p * (1 - e2))
-    for _ in range(10):
-        n = a / np.sqrt(1 - e2 * np.sin(latitude) ** 2)
-        height = p / np.cos(latitude) - n
-        latitude = np.arctan2(z, p * (1 - e2 * n / (n + height)))
-    return np.degrees(latitude), np.degrees(np.arctan2(y, x)), height
 
 
 def test_a_georeferenced_run_lies_on_the_globe(trained, tmp_path):
