@@ -107,9 +107,8 @@ def test_no_other_file_is_replaced(lineage_run, tmp_path, failure):
     assert main(["gate", "fit", str(run), "--out", str(gate)]) == 0
     births = next((run / "lineage").glob("births*.parquet"))
     before = births.read_bytes()
-    assert "is not a sample of spawns: choose another --out" in failure(
-        "gate", "sample", run, "--out", births
-    )
+    error = failure("gate", "sample", run, "--out", births)
+    assert "is not a sample of spawns: choose another --out" in error
     assert births.read_bytes() == before
     sample = str(tmp_path / "sample.parquet")
     for _ in range(2):
