@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from blitzgs.cli import main
+from tests.helpers import BACKENDS, DEVICES
 from tests.training.tiny import OVERRIDES, as_flags, write_tiny_capture
 
 # Folders of tests with tiny trainings.
@@ -38,6 +39,18 @@ def one_thread(request):
         torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(params=DEVICES)
+def device(request):
+    """Run a test on the CPU and on the GPU."""
+    return request.param
+
+
+@pytest.fixture(params=BACKENDS)
+def backend(request):
+    """Run a test on each device, in each dtype of its kernels: (device, dtype)."""
+    return request.param
 
 
 @pytest.fixture

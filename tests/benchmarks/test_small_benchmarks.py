@@ -30,7 +30,7 @@ from blitzgs_synth.flight import plan_flight
 from blitzgs_synth.plan import PRESETS, Plan
 from blitzgs_synth.render import City
 from tests.formats.test_tiles import SCENE, city
-from tests.helpers import DEVICES, needs_cuda, refused
+from tests.helpers import needs_cuda, refused
 from tests.training.tiny import tiny_config, tiny_scene, write_tiny_capture
 
 
@@ -119,7 +119,6 @@ def trained(tmp_path_factory):
         yield folder
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_smooth_levels_pop_less(trained, tmp_path, device, capsys):
     pytest.importorskip("av", reason="the extra film is not installed")
     arguments = [str(trained), "--frames", "200", "--device", device, "--out", str(tmp_path / "shown")]

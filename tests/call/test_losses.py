@@ -11,7 +11,7 @@ from torch._subclasses.fake_tensor import DynamicOutputShapeException, FakeTenso
 from torch.autograd import forward_ad
 
 import blitzgs
-from tests.helpers import BACKENDS, refused, relative_error, ssim_map
+from tests.helpers import refused, relative_error, ssim_map
 
 
 def images(device, dtype, *lead):
@@ -35,7 +35,6 @@ def by_definition(x, y, masks, weight, padding):
     return sum(losses) / len(losses)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("padding", ["same", "valid"])
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])

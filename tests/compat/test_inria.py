@@ -6,7 +6,7 @@ import torch
 
 from blitzgs.compat import inria
 from blitzgs.reference.projection import sh_colors
-from tests.helpers import DEVICES, orbit_camera, refused, relative_error, ssim_map
+from tests.helpers import orbit_camera, refused, relative_error, ssim_map
 
 
 def camera(angle=0.3, distance=3.0, tanfovx=0.5, tanfovy=0.4, shift=(0.0, 0.0), dtype=torch.float64):
@@ -218,7 +218,6 @@ def test_the_depth_of_the_forks():
     compare(settings(), given, of_scales(), rasterizer=inria.DepthGaussianRasterizer)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("length", [1.0, 1.15])
 def test_float32_on_each_device(device, length):
     """Both ways, that of normalised rotations and that of others, against float64."""

@@ -22,7 +22,7 @@ from blitzgs.spawn.lineage import Cause
 from blitzgs.table.table import EXP_AVG_SQS, PARAMETERS, GaussianTable, opacity_logit
 from blitzgs.view.levels import Levels, measure_levels
 from tests.distributed.rank_harness import run_ranks
-from tests.helpers import DEVICES, needs_cuda
+from tests.helpers import needs_cuda
 from tests.population.test_density import LEVELS, SEED, STEP, TIME, random_table
 
 
@@ -181,7 +181,6 @@ def test_the_copies_of_other_rows_change_no_bit():
     assert [tuple(part.shape) for part in none] == [(0,), (0, 3)]
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_rows_that_stand_for_copies_equal_torch_s(device):
     n, least = 3 * MAX_COPIES, opacity_logit(0.05)
     g = torch.Generator().manual_seed(4)
@@ -203,7 +202,6 @@ def test_rows_that_stand_for_copies_equal_torch_s(device):
         torch.testing.assert_close(column.cpu(), wanted, rtol=3e-7, atol=0)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_draws_and_what_is_left_of_them_equal_torch_s(device):
     g = torch.Generator().manual_seed(6)
     opacities, causes = torch.randn(5000, generator=g) * 4, torch.randint(2, (5000,), generator=g).byte()

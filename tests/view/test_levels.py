@@ -15,7 +15,7 @@ from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Vi
 from blitzgs.reference.render import render as reference_render
 from blitzgs.view.gate import LodGate, ModelGate, centres_of
 from blitzgs.view.levels import FOOTPRINT_LEVELS, Levels, footprint_levels, footprint_sizes, measure_levels
-from tests.helpers import DEVICES, refused
+from tests.helpers import refused
 from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_views
 from tests.view.test_gate import GATE, OPTIONS, make_scene
 
@@ -138,7 +138,6 @@ def test_the_weights_fall_over_half_a_level_around_the_cut(fork):
     assert replace(gate, smooth=False).fade() == ()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_images_are_those_of_faded_opacities(device, antialiased):
     table = faint_scene(700, device)
@@ -158,7 +157,6 @@ def test_images_are_those_of_faded_opacities(device, antialiased):
         torch.testing.assert_close(images[view].double()[sure], expected.image[sure], rtol=0, atol=2e-4)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_the_gate_before_the_projection_changes_nothing(device):
     """All Gaussians that the gate leaves out have the weight 0."""
     table = faint_scene(6000, device)
@@ -174,7 +172,6 @@ def test_the_gate_before_the_projection_changes_nothing(device):
     assert not torch.equal(faded.renders, render_frame(table, views, OPTIONS, cut).renders)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_images_change_little_where_the_gate_makes_them_jump(device):
     """One Gaussian of level 2, seen from around its cut."""
     table = faint_scene(100, device)
@@ -201,7 +198,6 @@ def test_images_change_little_where_the_gate_makes_them_jump(device):
     assert largest[True] < 0.15 * largest[False]
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_gradients_are_those_of_opacities_that_faded_before(device, antialiased):
     """The weight is a factor of the opacity's gradient, and a constant for means and poses."""
@@ -260,7 +256,6 @@ def test_errors_name_the_value():
     refused(RuntimeError, "level must be Byte, got Int", call, table["level"].int(), SMOOTH.fade())
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_opcheck(device):
     table = faint_scene(50, device)
     viewmats, Ks = make_views(2, device)
