@@ -30,7 +30,7 @@ from blitzgs_synth.flight import plan_flight
 from blitzgs_synth.plan import PRESETS, Plan
 from blitzgs_synth.render import City
 from tests.formats.test_tiles import SCENE, city
-from tests.helpers import needs_cuda, refused
+from tests.helpers import refused
 from tests.training.tiny import tiny_config, tiny_scene, write_tiny_capture
 
 
@@ -173,7 +173,6 @@ def test_the_default_is_exact_to_float_rounding(scene):
 
 
 @pytest.mark.cuda
-@needs_cuda
 @pytest.mark.parametrize("option", bm_accuracy.options_for("cuda"), ids=lambda option: option.name)
 def test_every_option_keeps_the_bounds_on_cuda(option):
     scene = aerial(300_000, "cuda", views=option.views, width=1200, height=800)

@@ -6,7 +6,7 @@ import torch
 
 import blitzgs
 from blitzgs.optim import LazyAdam
-from tests.helpers import needs_cuda, random_scene, refused, relative_error
+from tests.helpers import random_scene, refused, relative_error
 
 NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
@@ -286,7 +286,6 @@ def test_gradients_of_two_views_may_come_at_once(device):
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_a_call_is_repeated_if_there_was_too_little_room():
     """A first view sees a few Gaussians, so that the next one needs more than was estimated."""
     scene = random_scene(n=2000, cameras=2, width=96, height=80, device="cuda")
@@ -309,7 +308,6 @@ def test_a_call_is_repeated_if_there_was_too_little_room():
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_memory_follows_what_is_visible():
     scene = random_scene(n=1000, cameras=1, device="cuda")
     p = raw_parameters(scene)

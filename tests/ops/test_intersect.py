@@ -6,7 +6,7 @@ import torch
 
 from blitzgs.ops.intersect import intersect, tile_counts
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT
-from tests.helpers import needs_cuda, on_threads, refused
+from tests.helpers import on_threads, refused
 from tests.ops.splats import Splats, kept_by, pixel_alphas, random_splats, with_capacity
 
 WIDTH, HEIGHT = 91, 70
@@ -275,7 +275,6 @@ def test_images_and_gradients_ignore_entries_after_the_last_splat(n, channels, c
         assert torch.equal(found, expected)
 
 
-@needs_cuda
 @pytest.mark.cuda
 @pytest.mark.parametrize("tiles", [(0, -1), (3, 9)])
 @pytest.mark.parametrize(("n", "capacity"), [(700, 1500), (0, 900), (50_000, 60_000)])
@@ -299,7 +298,6 @@ def test_a_table_of_gradients_is_zeroed_for_the_splats(n, capacity, tiles):
     assert memory[:40].isnan().all() and memory[40 + capacity :].isnan().all()
 
 
-@needs_cuda
 @pytest.mark.cuda
 @pytest.mark.parametrize("share", [0.999, 0.5, 0.1, 0.0])
 @pytest.mark.parametrize("tiles", [(0, -1), (5, 40)])

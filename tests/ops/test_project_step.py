@@ -14,7 +14,7 @@ from blitzgs.ops.lazy_adam import (
 from blitzgs.ops.project import project
 from blitzgs.ops.projection_types import ProjectionOptions, WeightedViews
 from blitzgs.ops.splat_gradients import SplatGradients
-from tests.helpers import needs_cuda, refused
+from tests.helpers import refused
 
 BETA1, BETA2, EPS = 0.9**2, 0.999**2, 1e-15 / math.sqrt(2)
 STEP, WIDTH, HEIGHT, EPS2D = 70, 90, 60, 0.3
@@ -212,7 +212,6 @@ def test_errors_name_what_is_wrong_with_tables():
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_errors_name_what_does_not_fit():
     scene = Scene(20, 16, 1, "cuda")
     table = torch.zeros(len(scene.splats.means2d), 12, device="cuda")

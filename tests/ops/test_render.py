@@ -12,7 +12,7 @@ from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Sizes, splats_of
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.reference.render import composited_weights, median_splats, strongest_splats
-from tests.helpers import needs_cuda, random_scene, refused
+from tests.helpers import random_scene, refused
 from tests.ops.test_importance import crowded, lists_of
 
 
@@ -87,7 +87,6 @@ def test_images_are_those_of_lists_and_compositing(backend, with_depth):
 
 
 @pytest.mark.cuda
-@needs_cuda
 @pytest.mark.parametrize("cameras", [1, 4])
 @pytest.mark.parametrize("spare", [0, 1, 5000])
 def test_spare_capacity_changes_nothing(cameras, spare):
@@ -103,7 +102,6 @@ def test_spare_capacity_changes_nothing(cameras, spare):
 
 
 @pytest.mark.cuda
-@needs_cuda
 @pytest.mark.parametrize("missing", [(1, 0), (0, 1), (10, 10)])
 def test_too_little_capacity_writes_nothing_beyond_it(missing):
     tables, sh = tables_of("cuda")

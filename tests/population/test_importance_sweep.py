@@ -28,7 +28,7 @@ from blitzgs.reference.render import scores as by_definition
 from blitzgs.reference.render import top_mass
 from blitzgs.table.table import GaussianTable
 from tests.distributed.rank_harness import on_cuda, on_each_device, run_ranks
-from tests.helpers import look_at_origin, needs_cuda
+from tests.helpers import look_at_origin
 from tests.training.tiny import random_gaussians
 
 ALONE = Ranks()
@@ -165,7 +165,6 @@ def test_a_survey_reads_no_colours(device):
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_cuts_that_lag_behind_the_surveys_change_no_bit(monkeypatch):
     ranks, add = Ranks(device=torch.device("cuda")), importance._Sums.add
     table = population(ranks)

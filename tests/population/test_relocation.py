@@ -22,7 +22,6 @@ from blitzgs.spawn.lineage import Cause
 from blitzgs.table.table import EXP_AVG_SQS, PARAMETERS, GaussianTable, opacity_logit
 from blitzgs.view.levels import Levels, measure_levels
 from tests.distributed.rank_harness import run_ranks
-from tests.helpers import needs_cuda
 from tests.population.test_density import LEVELS, SEED, STEP, TIME, random_table
 
 
@@ -355,7 +354,6 @@ def test_no_live_gaussian_leaves_nothing_to_copy():
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_cuda_does_the_same():
     tables = []
     for device in ("cpu", "cuda"):

@@ -14,7 +14,7 @@ from blitzgs.runs.guard import NonFiniteError
 from blitzgs.training.events import densify
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.understood import small_batch_hint
-from tests.helpers import DEVICES, needs_cuda, refused
+from tests.helpers import DEVICES, refused
 from tests.training.tiny import (
     assert_same_table,
     events_of,
@@ -244,7 +244,6 @@ def test_a_run_is_not_overwritten_nor_resumed_with_another_configuration(whole_r
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_cuda_trains_like_the_cpu_and_resumes_exactly(whole_run, tmp_path):
     ranks = Ranks(device=torch.device("cuda"))
     on_gpu = partial(train, ranks=ranks)
