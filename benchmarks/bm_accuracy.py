@@ -34,8 +34,6 @@ from report_tables import accuracy_lines
 from scenes import BenchmarkScene, aerial
 from torch import Tensor
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.render import Frame, RenderOptions, render_frame
 from blitzgs.frame.tiles import TileAssignment, TileRanges

@@ -22,6 +22,7 @@ from typing import Any
 import torch
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.append(str(ROOT))  # of the helpers that benchmarks share with the tests
 WARM_UP = 5  # steps before those that count
 BEST_DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
