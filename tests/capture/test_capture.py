@@ -188,9 +188,8 @@ def test_masks_are_found_turned_and_shrunk_so_that_mixed_pixels_are_excluded(tmp
     write_capture(tmp_path, NAMES[:3], width=64, height=48)
     mask = np.full((48, 64), 255, dtype=np.uint8)
     mask[:, :17] = 0
-    (tmp_path / "masks").mkdir()
-    cv2.imwrite(str(tmp_path / "masks" / f"{NAMES[0]}.png"), mask)
-    cv2.imwrite(str(tmp_path / "masks" / "v01.png"), mask)
+    write_image(tmp_path / "masks" / f"{NAMES[0]}.png", mask)
+    write_image(tmp_path / "masks" / "v01.png", mask)
     store = ImageStore(load_capture(tmp_path, downscale=2))
     for index in (0, 1):
         found = store.mask(index).numpy()
@@ -203,9 +202,8 @@ def test_masks_are_found_turned_and_shrunk_so_that_mixed_pixels_are_excluded(tmp
 
 def test_a_mask_of_another_shape_is_refused(tmp_path):
     write_capture(tmp_path, NAMES[:1], width=64, height=48)
-    (tmp_path / "masks").mkdir()
     for size, fits in (((24, 32), True), ((383, 512), True), ((48, 48), False)):
-        cv2.imwrite(str(tmp_path / "masks" / "v00.png"), np.full(size, 255, dtype=np.uint8))
+        write_image(tmp_path / "masks" / "v00.png", np.full(size, 255, dtype=np.uint8))
         if fits:
             capture = load_capture(tmp_path)
             assert ImageStore(capture).mask(0).all()
@@ -339,10 +337,9 @@ def test_real_captures_load_and_decode(name, views, test, downscale):
 @pytest.mark.parametrize("name", ["mask_of_v00.png", "v00x.tif"])
 def test_masks_that_belong_to_no_image_are_not_ignored(tmp_path, name):
     root = write_capture(tmp_path, NAMES)
-    (root / "masks").mkdir()
     mask = np.zeros((48, 64), dtype=np.uint8)
-    cv2.imwrite(str(root / "masks" / name), mask)
+    write_image(root / "masks" / name, mask)
     refused(ValueError, f"none of the 1 masks in .*{name}.*data.masks=false", load_capture, root)
     assert load_capture(root, masks=False).cameras[0].mask_path is None
-    cv2.imwrite(str(root / "masks" / f"{NAMES[1]}.png"), mask)
+    write_image(root / "masks" / f"{NAMES[1]}.png", mask)
     warned(f"1 of 2 masks in .* belong to no image .first: {name}", load_capture, root)

@@ -156,10 +156,9 @@ def test_missing_images_of_transforms_are_named_by_their_paths(tmp_path):
 
 def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):
     frames = []
-    (tmp_path / "own").mkdir()
     for i in range(4):
         write_image(tmp_path / "images" / f"f{i}.png", smooth_image(48, 64, i))
-        cv2.imwrite(str(tmp_path / "own" / f"f{i}.png"), np.zeros((48, 64), dtype=np.uint8))
+        write_image(tmp_path / "own" / f"f{i}.png", np.zeros((48, 64), dtype=np.uint8))
         masks = [{}, {"mask_path": f"own/f{i}.png"}, {"mask_path": None}, {}][i]
         frames.append(frame(f"images/f{i}.png", at(i, 0, 0), **masks))
     write_ply(tmp_path / "p.ply", [[1, 2, 3], [4, 5, 6]], [[9, 8, 7], [1, 2, 3]])

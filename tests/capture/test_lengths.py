@@ -101,11 +101,9 @@ def misplaced(kind, rotations, centres, shift):
 )
 def test_one_camera_that_was_not_aligned_costs_one_view(tmp_path, form, kind, shift):
     rotations, centres, points = ring(shift)
-    (tmp_path / "right").mkdir()
     write(tmp_path / "right", form, rotations, centres, points)
     right, said = quiet_load(tmp_path / "right")
     assert not said and not right.about.strays and not right.apart
-    (tmp_path / "wrong").mkdir()
     write(tmp_path / "wrong", form, *misplaced(kind, rotations, centres, shift), points)
     wrong, said = quiet_load(tmp_path / "wrong")
     name = right.cameras[STRAY].name
@@ -185,7 +183,6 @@ def test_lengths_scale_exactly_with_the_world(tmp_path, kind):
     captures = []
     for factor in (1.0, 1024.0, 2.0**-7):
         root = tmp_path / str(factor)
-        root.mkdir()
         placed, at = misplaced(kind, rotations, centres, np.zeros(3))
         write(root, "binary", placed, at * factor, points * factor)
         captures.append((factor, quiet_load(root)[0]))

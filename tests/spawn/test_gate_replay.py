@@ -7,7 +7,6 @@ from dataclasses import replace
 from itertools import islice
 from unittest.mock import Mock
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -22,6 +21,7 @@ from blitzgs.spawn.gate import SpawnGate, gate_file
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.replay import OracleVeto, branch_point, event_keys, label_events, replay
 from blitzgs.training.trainer import Trainer
+from tests.capture.helpers import write_image
 from tests.conftest import LINEAGE
 from tests.distributed.rank_harness import run_ranks
 from tests.helpers import refused
@@ -131,8 +131,7 @@ def test_a_damaged_checkpoint_is_named(lineage_run, tmp_path):
 
 def test_a_run_without_a_view_to_measure_is_not_replayed(lineage_run, tmp_path, failure):
     capture, run = shutil.copytree(lineage_run / "capture", tmp_path / "capture"), lineage_run / "run"
-    (capture / "masks").mkdir()
-    cv2.imwrite(str(capture / "masks" / "00.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    write_image(capture / "masks" / "00.png", np.zeros((HEIGHT, WIDTH), np.uint8))
     error = failure("gate", "replay", "default", run, "--data", capture, "--out", tmp_path / "out")
     assert "its arms could not be compared, because the views" in error
     assert not (tmp_path / "out").exists()
