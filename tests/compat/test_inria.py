@@ -6,6 +6,7 @@ import torch
 
 from blitzgs.compat import inria
 from blitzgs.reference.projection import sh_colors
+from blitzgs.util.rotations import quaternion_matrices
 from tests.helpers import orbit_camera, refused, relative_error, ssim_map
 
 
@@ -23,16 +24,7 @@ def camera(angle=0.3, distance=3.0, tanfovx=0.5, tanfovy=0.4, shift=(0.0, 0.0), 
 
 def covariances(scales, rotations, modifier):
     """The 3D covariances; the quaternions are not normalised."""
-    r, x, y, z = rotations.unbind(1)
-    matrix = torch.stack(
-        [
-            1 - 2 * (y * y + z * z), 2 * (x * y - r * z), 2 * (x * z + r * y),
-            2 * (x * y + r * z), 1 - 2 * (x * x + z * z), 2 * (y * z - r * x),
-            2 * (x * z - r * y), 2 * (y * z + r * x), 1 - 2 * (x * x + y * y),
-        ],
-        dim=1,
-    ).view(-1, 3, 3)  # fmt: skip
-    scaled = matrix @ torch.diag_embed(modifier * scales)
+    scaled = quaternion_matrices(rotations) @ torch.diag_embed(modifier * scales)
     return scaled @ scaled.transpose(1, 2)
 
 
