@@ -216,9 +216,21 @@ def positive(text: str) -> int:
     return value
 
 
+def add_pool_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of every command that trains in a `Pool`."""
+    parser.add_argument("--out", type=Path, required=True, metavar="RESULTS", help="folder of the results")
+    gpus = torch.cuda.device_count()
+    parser.add_argument(
+        "--gpus", type=int, default=gpus, metavar="N", help="to use; 0: the CPU (%(default)s)"
+    )
+    parser.add_argument("--per-gpu", type=positive, default=1, metavar="N", help="runs on each (%(default)s)")
+    parser.add_argument("--lpips", type=Path, metavar="FILE", help="TorchScript module of LPIPS with weights")
+    parser.add_argument("--minutes", type=float, metavar="M", help="start no run later than this")
+
+
 def make_parser() -> argparse.ArgumentParser:
     parser = harness.make_parser(__doc__, device=None, writes_json=False)
-    parser.add_argument("--out", type=Path, required=True, metavar="RESULTS", help="folder of the results")
+    add_pool_flags(parser)
     parser.add_argument("--capture", action="append", default=[], metavar='"NAME=DIR [--data.FIELD=VALUE]"')
     parser.add_argument("--recipe", action="append", default=[], metavar='"NAME=SOURCE [--FIELD=VALUE]"')
     parser.add_argument("--seeds", type=int, nargs="+", help="of the trainings (default: 0)")
@@ -233,17 +245,8 @@ def make_parser() -> argparse.ArgumentParser:
         help="measure held-out views after so many images, and at the end (%(default)s)",
     )
     parser.add_argument(
-        "--lpips", type=Path, metavar="FILE", help="TorchScript module of LPIPS with its weights"
-    )
-    gpus = torch.cuda.device_count()
-    parser.add_argument(
-        "--gpus", type=int, default=gpus, metavar="N", help="to use; 0: the CPU (%(default)s)"
-    )
-    parser.add_argument("--per-gpu", type=positive, default=1, metavar="N", help="runs on each (%(default)s)")
-    parser.add_argument(
         "--ranks", type=positive, default=1, metavar="N", help="GPUs that train each run (%(default)s)"
     )
-    parser.add_argument("--minutes", type=float, metavar="M", help="start no run later than this")
     parser.add_argument(
         "--collect", type=Path, nargs="*", metavar="SOURCE",
         help="add these runs; without recipes, report alone",
