@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -213,7 +213,9 @@ def test_a_pose_has_a_last_row():
 
 GAUSSIANS = ("means", "quats", "scales", "opacities", "colors")
 seeds = st.integers(0, 10**6)
-quickly = settings(max_examples=5, deadline=None, derandomize=True)
+# The fixture `device` has no state that examples could share.
+stateless = [HealthCheck.function_scoped_fixture]
+quickly = settings(max_examples=5, deadline=None, derandomize=True, suppress_health_check=stateless)
 
 
 def image_of(scene, **options):
