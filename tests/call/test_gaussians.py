@@ -11,13 +11,7 @@ from scipy.special import sph_harm_y
 import blitzgs
 from blitzgs.call.covariances import decompose
 from blitzgs.reference.projection import covariance_factors
-from tests.helpers import (
-    agree,
-    random_scene,
-    rasterize_scene,
-    refused,
-    relative_error,
-)
+from tests.helpers import agree, random_scene, rasterize_scene, refused, relative_error
 from tests.population.test_relocation import by_the_double_sum
 
 

@@ -13,14 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import blitzgs
 from blitzgs.runs.cameras import checked_camera
-from tests.helpers import (
-    agree,
-    image_error,
-    random_scene,
-    rasterize_scene,
-    reference_images,
-    refused,
-)
+from tests.helpers import agree, image_error, random_scene, rasterize_scene, reference_images, refused
 
 IMAGE_BOUND = {torch.float32: 1e-5, torch.float64: 1e-10}
 GRADIENT_BOUND = {torch.float32: 1e-4, torch.float64: 1e-10}

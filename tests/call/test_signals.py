@@ -12,14 +12,7 @@ import blitzgs
 from blitzgs.reference import render
 from blitzgs.reference.projection import normals, sh_colors, sh_values
 from blitzgs.reference.render import composited_weights, median_splats
-from tests.helpers import (
-    agree,
-    image_error,
-    random_scene,
-    rasterize_scene,
-    refused,
-    relative_error,
-)
+from tests.helpers import agree, image_error, random_scene, rasterize_scene, refused, relative_error
 
 E = 5
 # Largest error against float64, by dtype, of images and of gradients.
