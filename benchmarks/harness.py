@@ -138,6 +138,26 @@ def make_parser(
     return parser
 
 
+def positive(text: str) -> int:
+    """Read a number of at least 1."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, got {value}")
+    return value
+
+
+def add_pool_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the commands that train runs side by side (`bm_quality.Pool`)."""
+    parser.add_argument("--out", type=Path, required=True, metavar="RESULTS", help="folder of the results")
+    gpus = torch.cuda.device_count()
+    parser.add_argument(
+        "--gpus", type=int, default=gpus, metavar="N", help="to use; 0: the CPU (%(default)s)"
+    )
+    parser.add_argument("--per-gpu", type=positive, default=1, metavar="N", help="runs on each (%(default)s)")
+    parser.add_argument("--lpips", type=Path, metavar="FILE", help="TorchScript module of LPIPS with weights")
+    parser.add_argument("--minutes", type=float, metavar="M", help="start no run later than this")
+
+
 def report(
     title: str, rows: Sequence[dict[str, Any]], path: Path | None, device: torch.device | str = "cpu"
 ) -> None:

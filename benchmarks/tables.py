@@ -178,7 +178,7 @@ def tabulate(table: str, plan: dict[str, Any], out: Path) -> str:
 def make_parser() -> argparse.ArgumentParser:
     parser = harness.make_parser(__doc__, device=None, writes_json=False)
     parser.add_argument("table", choices=TABLES)
-    bm_quality.add_pool_flags(parser)
+    harness.add_pool_flags(parser)
     parser.add_argument("--scenes", nargs="+", default=[], metavar='"NAME=DIR [--data.FIELD=VALUE]"')
     parser.add_argument("--runs", nargs="+", default=[], metavar="NAME=RUN", help="for oracle and popping")
     parser.add_argument(
@@ -189,7 +189,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--gate", type=Path, metavar="FILE", help="spawn gate, fitted on other scenes")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument(
-        "--ranks", type=bm_quality.positive, nargs="+", default=[1, 2, 4], help="of scaling and cost"
+        "--ranks", type=harness.positive, nargs="+", default=[1, 2, 4], help="of scaling and cost"
     )
     parser.add_argument("--collect", type=Path, nargs="+", default=[], metavar="SOURCE")
     parser.add_argument("--resume", action="store_true", help="carry on in a folder that has results")
