@@ -32,10 +32,10 @@ from typing import Any
 
 import quality_report
 import torch
-from bm_quality import Pool, positive, work
+from bm_quality import Pool, work
 from city_report import TABLES
 from city_run import RESERVE, CityRun
-from harness import ROOT, command_line, make_parser, markdown_table, write_json
+from harness import ROOT, command_line, make_parser, markdown_table, positive, write_json
 from quality_plan import parse_named, runs_of
 
 CONFIG = ROOT / "configs" / "city.yaml"
@@ -101,8 +101,7 @@ def plan(args: Any, overrides: Sequence[str]) -> list[CityRun]:
         chosen = {arm: recipes[arm] + batch for arm in (arms if is_first else [first])}
         for spec in runs_of(capture, chosen, [0], [], None, device, ranks):
             frames = args.popping if is_first and spec.recipe == first else 0
-            limits = {"limit": args.seconds_per_run, "popping": frames, "command": command_line()}
-            runs.append(CityRun(**dataclasses.asdict(spec), **limits))
+            runs.append(CityRun(**dataclasses.asdict(spec), limit=args.seconds_per_run, popping=frames))
     return runs
 
 
@@ -132,7 +131,7 @@ def collect(args: Any) -> str:
         return "no run has any results yet"
     known = [run for run in runs if "environment" in run]  # those that got as far as their training
     about = {
-        "command": "; ".join(sorted({run["command"] for run in known})),
+        "command": command_line(),
         "commit": " and ".join(sorted({run["commit"] for run in runs})),
         "environment": known[0]["environment"] if known else {},
     }

@@ -52,7 +52,6 @@ class CityRun(RunSpec):
 
     limit: float = 100.0  # seconds after which the process ends itself, whatever it does
     popping: int = 0  # frames of the flight after the evaluation, 0: none
-    command: str = ""  # of the benchmark that started the run
 
 
 class CityTrainer(Trainer):
@@ -202,7 +201,7 @@ def main(arguments: Sequence[str]) -> int:
     watchdog = threading.Timer(spec.limit, os._exit, (1,))
     watchdog.daemon = True
     watchdog.start()
-    result = describe(spec) | {"status": "running", "finished": False, "command": spec.command}
+    result = describe(spec) | {"status": "running", "finished": False}
     with tempfile.TemporaryDirectory() as folder:
         try:
             train(spec, result, result_path, Path(folder), since)

@@ -10,11 +10,10 @@ from pathlib import Path
 
 import gpu_record
 import harness
+import measure
 import pytest
 import report
 import report_tables
-
-from tests.helpers import needs_cuda
 
 PAGE = "before\n<!-- table: {0} -->\nold\n<!-- end: {0} -->\nafter\n"
 
@@ -44,6 +43,33 @@ def test_the_exchange_benchmark_writes_what_the_report_reads(tmp_path):
         assert f"\n{line}" in page
 
 
+def measure_with(monkeypatch, tmp_path, flags):
+    tiny = f"python benchmarks/bm_exchange.py {flags}"
+    monkeypatch.setattr(measure, "COMMANDS", {"exchange": tiny, "quality": "python CAPTURE", "step_1": ""})
+    gpus = {"exchange": 0, "quality": 0, "step_1": 4}
+    monkeypatch.setattr(measure, "PLAN", tuple(measure.Job(*job) for job in gpus.items()))
+    monkeypatch.setenv("BLITZGS_COMMIT", "abc")
+    folders = ["--work", str(tmp_path / "work"), "--results", str(tmp_path / "results")]
+    return measure.main([*folders, "--gpus", "0", "--only", "exchange", "quality", "step_1"])
+
+
+def test_one_command_measures_what_it_can_and_continues(tmp_path, monkeypatch, capsys):
+    assert measure_with(monkeypatch, tmp_path, "--device cpu --no-such-flag") == 1
+    printed = capsys.readouterr().out
+    assert f"exchange: FAILED, see {tmp_path}/work/exchange.log" in printed
+    assert (
+        "quality: not measured, needs a capture" in printed
+        and "step_1: not measured, needs 4 GPUs" in printed
+    )
+    assert "no-such-flag" in (tmp_path / "work" / "exchange.log").read_text()
+    good = "--gaussians 2000 --ranks 1 --batch 1 --batches 1 --visits 1 --device cpu"
+    measure_with(monkeypatch, tmp_path, good)
+    assert "exchange: done" in capsys.readouterr().out
+    assert json.loads((tmp_path / "results" / "exchange.json").read_text())["commit"] == "abc"
+    measure_with(monkeypatch, tmp_path, good)
+    assert "exchange" not in capsys.readouterr().out
+
+
 def test_the_commit_is_that_of_the_checkout(monkeypatch):
     monkeypatch.delenv("BLITZGS_COMMIT", raising=False)
     monkeypatch.setattr(harness, "_git", lambda *words: "" if words[0] == "status" else "0123456789")
@@ -60,7 +86,6 @@ def test_a_copy_without_a_repository_has_no_commit(monkeypatch, tmp_path):
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_render_and_step_write_what_the_report_reads(tmp_path, monkeypatch):
     import bm_render
     import bm_step

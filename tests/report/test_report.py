@@ -18,7 +18,7 @@ from blitzgs.report.report import MAX_BYTES, compare, differences, fitted, label
 from blitzgs.runs.evaluation import PARTS, Previews, preview_file
 from blitzgs.runs.folder import open_run
 from blitzgs.util.errors import kept_warnings
-from tests.browser import Browser, needs_chromium, wait_for
+from tests.browser import Browser, wait_for
 from tests.helpers import refused
 from tests.training.tiny import OVERRIDES, as_flags, at_step, events_of, train, write_tiny_capture
 
@@ -284,7 +284,6 @@ def column(browser, section, number):
     )
 
 
-@needs_chromium
 def test_the_report_opens_from_the_disk(browser):
     def counts():
         return browser.evaluate(
@@ -302,7 +301,6 @@ def test_the_report_opens_from_the_disk(browser):
     assert browser.errors() == []
 
 
-@needs_chromium
 def test_a_click_on_a_title_sorts_the_table(browser):
     first = [float(text) for text in column(browser, "views", 1)]
     assert first == sorted(first)
@@ -313,7 +311,6 @@ def test_a_click_on_a_title_sorts_the_table(browser):
     assert names == sorted(names)
 
 
-@needs_chromium
 def test_a_wipe_changes_the_picture(browser):
     browser.evaluate("document.querySelector('.stage').scrollIntoView()")
     time.sleep(0.3)
@@ -338,7 +335,6 @@ def test_a_wipe_changes_the_picture(browser):
 
 
 @pytest.mark.slow
-@needs_chromium
 def test_the_model_is_shown_in_three_dimensions(browser):
     browser.evaluate("document.querySelector('#look button').click()")
     browser.evaluate("document.querySelector('#look').scrollIntoView()")
@@ -358,7 +354,6 @@ def test_the_model_is_shown_in_three_dimensions(browser):
     assert browser.errors() == []
 
 
-@needs_chromium
 def test_both_pages_fit_a_phone(trained, other, browser):
     size = {"height": 720, "deviceScaleFactor": 1, "mobile": False}
     browser.call("Emulation.setDeviceMetricsOverride", width=390, **size)
@@ -369,7 +364,6 @@ def test_both_pages_fit_a_phone(trained, other, browser):
     browser.call("Emulation.setDeviceMetricsOverride", width=1280, **size)
 
 
-@needs_chromium
 def test_hostile_names_are_shown_as_they_are(trained, tmp_path, browser):
     def renamed(content):
         content["cameras"] = [

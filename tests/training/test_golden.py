@@ -39,7 +39,6 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.trainer import Trainer
 from tests.capture.helpers import ROOT, shared_data
-from tests.helpers import needs_cuda
 from tests.training.tiny import events_of, read_log, steps_of, tiny_config, tiny_scene
 
 GOLDEN = Path(__file__).with_name("golden.json")
@@ -194,10 +193,7 @@ def train_capture(device: str, capture: str, seed: int, folder: Path) -> dict[st
 @pytest.mark.skipif(shared_data() is None, reason="the real captures are not here")
 @pytest.mark.parametrize(
     "device, capture",
-    [
-        pytest.param(*case, marks=[pytest.mark.cuda, needs_cuda] if case[0] == "cuda" else [])
-        for case in CASES
-    ],
+    [pytest.param(*case, marks=pytest.mark.cuda if case[0] == "cuda" else []) for case in CASES],
 )
 def test_quality_stays_in_its_band(golden, device, capture, tmp_path):
     centre = golden["captures"].get(f"{device} {capture}")

@@ -14,7 +14,7 @@ from blitzgs.table.pool import Pool, PoolError
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.visible import VisibleFinder
 from tests.distributed.rank_harness import run_ranks
-from tests.helpers import DEVICES, refused
+from tests.helpers import refused
 from tests.training import tiny
 from tests.training.tiny import (
     HEIGHT,
@@ -82,7 +82,6 @@ VARIANTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_a_run_with_a_quarter_of_its_blocks_on_the_device_is_the_same_run(tmp_path, variant, device):
     options = (*VARIANTS[variant], "model.deterministic=true")

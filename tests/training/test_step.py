@@ -31,7 +31,7 @@ from blitzgs.training.trainer import Trainer
 from blitzgs.view.gate import ViewGate
 from blitzgs_synth.generate import generate_city
 from tests.distributed.rank_harness import run_ranks
-from tests.helpers import DEVICES, look_at_origin, parameter_gradients
+from tests.helpers import look_at_origin, parameter_gradients
 from tests.training.tiny import (
     assert_same_table,
     events_of,
@@ -78,7 +78,6 @@ def test_a_step_tells_its_stages_and_lowers_the_loss():
 EXTENT, CONFIG = 1.7, LossConfig(opacity=0.3, scale=0.5, scale_reference=2.0)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_regularisers_are_means_over_the_visible_gaussians_of_a_view(device):
     plain = random_gaussians(300)
     table = GaussianTable({name: plain[name].to(device) for name in plain})
@@ -180,7 +179,6 @@ def scratch_of_a_step(unseen: int, device: str) -> int:
     return peak_bytes(lambda: step(6), device)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_scratch_of_a_step_does_not_grow_with_what_is_not_seen(device):
     few, many = scratch_of_a_step(40_000, device), scratch_of_a_step(16 * 40_000, device)
     assert few > 8 * SEEN  # the step saw Gaussians, and its memory was measured

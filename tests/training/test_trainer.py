@@ -14,7 +14,7 @@ from blitzgs.runs.guard import NonFiniteError
 from blitzgs.training.events import densify
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.understood import small_batch_hint
-from tests.helpers import DEVICES, needs_cuda, refused
+from tests.helpers import refused
 from tests.training.tiny import (
     assert_same_table,
     events_of,
@@ -208,7 +208,6 @@ def test_views_that_see_nothing(tmp_path):
     assert torch.equal(trainer.state.table["means"], before)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_non_finite_values_stop_the_run_by_name(tmp_path, device):
     trainer = make_trainer(tmp_path, ranks=Ranks(device=torch.device(device)))
     trainer.state.table["scales"][trainer.state.table["id"] == 7, 1] = float("nan")
@@ -240,7 +239,6 @@ def test_a_run_is_not_overwritten_nor_resumed_with_another_configuration(whole_r
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_cuda_trains_like_the_cpu_and_resumes_exactly(whole_run, tmp_path):
     ranks = Ranks(device=torch.device("cuda"))
     on_gpu = partial(train, ranks=ranks)
