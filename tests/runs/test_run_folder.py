@@ -221,7 +221,7 @@ def test_eval_uses_the_configuration_of_the_checkpoint(copy, tmp_path, capsys, c
         (["--resume", "--loss.ssim=0.3"], "loss.ssim: the checkpoint was trained with 0.2, now 0.3"),
         (["--extend=1.5", "--loss.ssim=0.3"], "loss.ssim: the checkpoint was trained with 0.2, now 0.3"),
         (["--resume", "--population.gate=no.json"], "no.json: no such gate; `blitzgs gate fit` makes one"),
-        (["--check", "--population.gate=no.json"], "no.json: no such gate"),
+        (["--check", "--config=defaults", "--population.gate=no.json"], "no.json: no such gate"),
         # What the capture decides is compared when it is known.
         (["--resume", "--model.near=0", "--schedule.images_per_view=9", "--loss.opacity_total=1"], "nowhere"),
     ],

@@ -14,7 +14,7 @@ from blitzgs.config.schedule import Schedule
 from blitzgs.training.batches import BatchLoader
 from blitzgs.training.sampler import BatchSampler, tour_of
 from blitzgs.view.views import Space, ViewSet
-from tests.helpers import DEVICES, look_at_origin, refused
+from tests.helpers import look_at_origin, refused
 from tests.training.tiny import Camera, Images
 
 SIZES = [(48, 32)] * 5 + [(30, 20)] * 3
@@ -52,7 +52,6 @@ def make_loader(capture):
         yield make
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("ahead", [0, 1, 3])
 def test_each_step_gets_its_own_views(capture, make_loader, device, ahead):
     _, images = capture
@@ -81,7 +80,6 @@ def test_each_step_gets_its_own_views(capture, make_loader, device, ahead):
             assert masks is None
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("ahead", [0, 3])
 def test_reduced_photographs_and_their_cameras(capture, make_loader, device, ahead):
     """Also where the resolution rises, and where the pace changes when later batches are prepared already."""
@@ -148,7 +146,6 @@ def test_photographs_are_decoded_before_their_batches_are_assembled(
     assert loader.waited > 0
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("ahead", [0, 2])
 @pytest.mark.parametrize("error", [OSError, ValueError])
 def test_memory_is_used_once_though_batches_could_not_be_made(
