@@ -18,7 +18,7 @@ from blitzgs.capture.capture import load_capture
 from blitzgs.capture.world import geodetic
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
-from blitzgs.formats.models import FORMATS, read_gaussians
+from blitzgs.formats.models import FORMATS, offset_of, read_gaussians
 from blitzgs.formats.ply import write_ply
 from blitzgs.runs.trained_model import open_model
 from blitzgs.runs.world import load_world_frame
@@ -120,8 +120,12 @@ def test_files_keep_their_place_in_the_world(whole, tmp_path, capsys):
             assert main(["export", str(tmp_path / source), f"--{kind}", str(path)]) == 0
             assert "coordinates are relative to" in capsys.readouterr().out
             offset = json.loads((tmp_path / f"model.{kind}.offset.json").read_text())["offset"]
-            found = read_gaussians(path).means.double() + torch.tensor(offset, dtype=torch.float64)
-            assert (found - means).abs().max() < 0.02
+            found = read_gaussians(path)
+            assert (
+                found.means.double() + torch.tensor(offset, dtype=torch.float64) - means
+            ).abs().max() < 0.02
+            # The file is read with the offset beside it, so that another conversion keeps the place.
+            assert offset_of(found.comments) == tuple(offset)
         assert main(["export", str(whole), f"--{kind}", str(path)]) == 0
         assert not (tmp_path / f"model.{kind}.offset.json").exists()
 
