@@ -299,10 +299,12 @@ def test_polygons_of_files(tmp_path):
         "# region\n0 0\n2, 0\n\n1 5\n",
         json.dumps(polygon),
         json.dumps({"type": "FeatureCollection", "features": [{"geometry": polygon}]}),
+        "\ufeff" + json.dumps(polygon),
     ):
         path.write_text(text)
         np.testing.assert_array_equal(read_polygon(path), ring)
     bad = ("0 0\n1 1\n", "0 0\nx y\n1 1\n", "0 0\n1 1\nnan 2\n", "{", '{"type": "Point"}', "0 0 0\n" * 4)
-    for text in bad:
+    two = json.dumps({"type": "FeatureCollection", "features": [{"geometry": polygon}] * 2})
+    for text in (*bad, two):
         path.write_text(text)
         refused(ValueError, "region cannot be read as a polygon", read_polygon, path)
