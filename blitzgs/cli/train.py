@@ -214,9 +214,9 @@ def run(args: argparse.Namespace) -> None:
                 trainer.watch(live_page(trainer.state, args.viewer, args.viewer_host))
             summary = trainer.train()
             if ranks.rank == 0:
-                write_final_report(args.out, summary)
+                reported = write_final_report(args.out, summary)
                 if summary is not None:
-                    _print_summary(summary, args.out)
+                    _print_summary(summary, args.out, reported)
 
 
 def _check(args: argparse.Namespace, config: Config) -> None:
@@ -283,7 +283,7 @@ _FIGURES: dict[str, tuple[str, int, float]] = {
 }
 
 
-def _print_summary(summary: dict[str, object], folder: Path) -> None:
+def _print_summary(summary: dict[str, object], folder: Path, reported: bool) -> None:
     console, table = Console(emoji=False), Table(show_header=False)
     # Print the path verbatim: rich must not interpret brackets and colons in it.
     console.print(printable(str(folder)), markup=False, highlight=False, soft_wrap=True)
@@ -305,7 +305,7 @@ def _print_summary(summary: dict[str, object], folder: Path) -> None:
     }
     width = max(map(len, commands))
     for text in (
-        f"report: {folder / run_files.REPORT}",
+        *([f"report: {folder / run_files.REPORT}"] if reported else []),
         f"pictures: {folder / run_files.EVALUATION}",
         "next:",
         *(f"  blitzgs {command:{width}}   {what}" for command, what in commands.items()),
