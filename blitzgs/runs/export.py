@@ -24,14 +24,13 @@ from blitzgs.formats.models import (
     offset_of,
     stated_offset,
 )
+from blitzgs.formats.ply import MAX_ROUNDING
 from blitzgs.runs.folder import Model
 from blitzgs.runs.source import Changed
 from blitzgs.util.output import write_file
 from blitzgs.view.views import CameraLike, Space
 
 COORDINATES = ("auto", "capture", "centred")
-# Positions may be rounded by this share of the median Gaussian's middle axis.
-_MAX_ROUNDING = 0.01
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ def export(
     offset = np.array(space.offset)
     farthest, middle = _measured(source, offset)
     rounding = float(np.spacing(np.float32(farthest))) / 2
-    centred = coordinates == "centred" or (coordinates == "auto" and rounding > _MAX_ROUNDING * middle)
+    centred = coordinates == "centred" or (coordinates == "auto" and rounding > MAX_ROUNDING * middle)
     if coordinates == "auto" and kind.quantised:
         centred |= float(np.linalg.norm(offset)) > 2 * space.extent * space.unit
     if centred:
