@@ -86,6 +86,15 @@ def test_a_training_begins_with_a_file(trained, whole, tmp_path, capsys):
     assert main([*arguments[:-3], str(tmp_path / "b"), "--start", str(whole), *flags,
                  "--population.max_gaussians=3"]) == 1  # fmt: skip
     assert "population.max_gaussians is 3" in capsys.readouterr().err
+    # Levels of another run mean other distances.
+    first.levels, first.comments = (
+        torch.arange(len(first)) % 20.0,
+        ["comment lod reference_distance 8.0 fork 1.19 levels 32 finest 31"],
+    )
+    write_ply(tmp_path / "levels.ply", **vars(first))
+    arguments[-3:] = [str(tmp_path / "c"), "--start", str(tmp_path / "levels.ply")]
+    assert main([*arguments, *flags]) == 0
+    assert not open_model(tmp_path / "c", Ranks()).table["level"].any()
 
 
 def test_selections_of_a_run(trained, whole, tmp_path):
