@@ -82,7 +82,8 @@ FLAGS = """
 --config RECIPE  name of a recipe, or a YAML file (default: aerial on a GPU, aerial_cpu on a CPU)
 --data DIR  folder of the capture, or another program's project
 --out RUN  folder for the results
---start FILE  begin with the Gaussians of a file (PLY, SPZ, SOG, .splat) in the capture's coordinates
+--start FILE  begin with the Gaussians of a file (PLY, SPZ, SOG, .splat) in the capture's coordinates (under
+    torchrun, which refuses this flag: --model.start=FILE)
 --resume  continue from the newest checkpoint in RUN, if any
 --extend IMAGES|FACTOR  train the finished run in RUN longer: by a number of images (100 or more), or to a
     multiple of its length (--extend=1.5)
