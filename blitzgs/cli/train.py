@@ -255,8 +255,8 @@ def _config(args: argparse.Namespace) -> Config:
     begun = args.resume and own is not None and any((args.out / run_files.CHECKPOINTS).glob("checkpoint_*"))
     if args.minutes and begun and own is not None and own.exists() and load_config(own).schedule.minutes == 0:
         raise ConfigError(
-            f"--minutes: the run in {args.out} began without it, so its length is decided: leave out "
-            "--minutes to continue it; once it is finished, --extend 1.5 trains half as long again"
+            f"--minutes: the run in {args.out} began without it or was extended, so its length is decided: "
+            "leave out --minutes to continue it; once it is finished, --extend 1.5 trains half as long again"
         )
     config = load_config(source, [*args.overrides, *minutes])
     if args.data is not None:
