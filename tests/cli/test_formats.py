@@ -306,7 +306,8 @@ def test_a_training_of_a_project_knows_its_world_and_resuming_keeps_an_alignment
     visitor.stance = Stance(visitor.world.page_position(np.zeros(3)), np.eye(3), 0.8)
     picture = SimpleNamespace(gaussians=1, milliseconds=1.0)
     ask = SimpleNamespace(look=SimpleNamespace(width=3, height=2, mode="RGB"), camera=None)
-    shown = SimpleNamespace(ask=ask, picture=picture, psnr=None, low=None, high=None)
+    shaded = SimpleNamespace(psnr=None, low=None, high=None)
+    shown = SimpleNamespace(ask=ask, picture=picture, shaded=shaded)
     assert "47.5000000\N{DEGREE SIGN} 8.2500000\N{DEGREE SIGN} 432.00 m (WGS 84)" in overlay(
         visitor, shown, ""
     )
