@@ -96,8 +96,8 @@ FLAGS = f"""
 SELECTION = """
 --crop-polygon FILE  keep this region: a GeoJSON polygon, or lines "x y", in the coordinates of --crop
 --min-opacity O  keep Gaussians of at least this opacity
---most N  keep the N Gaussians that contribute most to views of the capture (of a file: of the largest opacity
-    times length)
+--most N  keep the N Gaussians that contribute most to views of the capture (of a file, and in tiles and
+    streamed SOG: of the largest opacity times length)
 --levels FIRST-LAST  keep these octree levels, for example 0-3
 """
 _TILES = "--tiles and --streamed-sog"

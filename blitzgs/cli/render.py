@@ -84,7 +84,8 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
     """Add the command."""
     parser = arguments.add_command(commands, "render", run, summary, HELP)
     arguments.add_model(parser)
-    arguments.add_flags(parser, "--data DIR  take the cameras from this capture, not from the run")
+    text = "--data DIR  read the cameras anew from this capture, that of the run (of others: --cameras)"
+    arguments.add_flags(parser, text)
     arguments.add_device(parser, shares_gpus=True)
     arguments.add_pool(parser)
     arguments.add_split(parser, "render")

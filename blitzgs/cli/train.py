@@ -91,7 +91,8 @@ FLAGS = """
 --config RECIPE  name of a recipe, or a YAML file (default: aerial on a GPU, aerial_cpu on a CPU)
 --data DIR  folder of the capture, or another program's project
 --out RUN  folder for the results
---start FILE  begin with the Gaussians of a file (PLY, SPZ, SOG, .splat) in the capture's coordinates
+--start FILE  begin with the Gaussians of a file (PLY, SPZ, SOG, .splat) in the capture's coordinates (under
+    torchrun, which refuses this flag: --model.start=FILE)
 --resume  continue from the newest checkpoint in RUN, if any
 --extend IMAGES|FACTOR  train the finished run in RUN longer: by a number of images (100 or more), or to a
     multiple of its length (--extend=1.5)
@@ -237,9 +238,9 @@ def run(args: argparse.Namespace) -> None:
                 trainer.watch(live_page(trainer.state, args.viewer, args.viewer_host))
             summary = trainer.train()
             if ranks.rank == 0:
-                write_final_report(args.out, summary)
+                reported = write_final_report(args.out, summary)
                 if summary is not None:
-                    _print_summary(summary, args.out)
+                    _print_summary(summary, args.out, reported)
 
 
 def _check(args: argparse.Namespace, config: Config) -> None:
@@ -277,8 +278,8 @@ def _config(args: argparse.Namespace) -> Config:
     begun = args.resume and own is not None and any((args.out / run_files.CHECKPOINTS).glob("checkpoint_*"))
     if args.minutes and begun and own is not None and own.exists() and load_config(own).schedule.minutes == 0:
         raise ConfigError(
-            f"--minutes: the run in {args.out} began without it, so its length is decided: leave out "
-            "--minutes to continue it; once it is finished, --extend 1.5 trains half as long again"
+            f"--minutes: the run in {args.out} began without it or was extended, so its length is decided: "
+            "leave out --minutes to continue it; once it is finished, --extend 1.5 trains half as long again"
         )
     config = load_config(source, [*args.overrides, *minutes])
     if args.data is not None:
@@ -306,7 +307,7 @@ _FIGURES: dict[str, tuple[str, int, float]] = {
 }
 
 
-def _print_summary(summary: dict[str, object], folder: Path) -> None:
+def _print_summary(summary: dict[str, object], folder: Path, reported: bool) -> None:
     console, table = Console(emoji=False), Table(show_header=False)
     # Print the path verbatim: rich must not interpret brackets and colons in it.
     console.print(printable(str(folder)), markup=False, highlight=False, soft_wrap=True)
@@ -328,7 +329,7 @@ def _print_summary(summary: dict[str, object], folder: Path) -> None:
     }
     width = max(map(len, commands))
     for text in (
-        f"report: {folder / run_files.REPORT}",
+        *([f"report: {folder / run_files.REPORT}"] if reported else []),
         f"pictures: {folder / run_files.EVALUATION}",
         "next:",
         *(f"  blitzgs {command:{width}}   {what}" for command, what in commands.items()),

@@ -89,10 +89,15 @@ class Progress:
         fork, smooth = level_fork(config), config.view.lod == "smooth"
         return LodGate(self.reference_distance, fork, self.level_count, self.finest_level, smooth)
 
+    @property
+    def least_gated(self) -> float:
+        """The smallest share of the Gaussians that a view with the LOD gate keeps; see `ModelGate`."""
+        return _SLACK * self.least_kept
+
     def model_gate(self, config: Config, table: GaussianTable, ranks: Ranks) -> ModelGate | None:
         """Return the LOD gate for any camera; None: it is not open. No step may be pending. Collective."""
         gate = self.lod_gate(config)
-        return None if gate is None else ModelGate(gate, MOST_KEPT, table, ranks, _SLACK * self.least_kept)
+        return None if gate is None else ModelGate(gate, MOST_KEPT, table, ranks, self.least_gated)
 
 
 @dataclass

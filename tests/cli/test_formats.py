@@ -18,7 +18,7 @@ from blitzgs.capture.capture import load_capture
 from blitzgs.capture.world import geodetic
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
-from blitzgs.formats.models import FORMATS, read_gaussians
+from blitzgs.formats.models import FORMATS, offset_of, read_gaussians
 from blitzgs.formats.ply import write_ply
 from blitzgs.runs.trained_model import open_model
 from blitzgs.runs.world import load_world_frame
@@ -84,6 +84,15 @@ def test_a_training_begins_with_a_file(trained, whole, tmp_path, failure):
     assert summary["psnr"] > before["psnr"] - 1.0
     again = (*arguments[:-3], tmp_path / "b", "--start", whole, *flags)
     assert "population.max_gaussians is 3" in failure(*again, "--population.max_gaussians=3")
+    # Levels of another run mean other distances.
+    first.levels, first.comments = (
+        torch.arange(len(first)) % 20.0,
+        ["comment lod reference_distance 8.0 fork 1.19 levels 32 finest 31"],
+    )
+    write_ply(tmp_path / "levels.ply", **vars(first))
+    arguments[-3:] = [str(tmp_path / "c"), "--start", str(tmp_path / "levels.ply")]
+    assert main([*arguments, *flags]) == 0
+    assert not open_model(tmp_path / "c", Ranks()).table["level"].any()
 
 
 def test_selections_of_a_run(trained, whole, tmp_path):
@@ -118,8 +127,12 @@ def test_files_keep_their_place_in_the_world(whole, tmp_path, capsys):
             assert main(["export", str(tmp_path / source), f"--{kind}", str(path)]) == 0
             assert "coordinates are relative to" in capsys.readouterr().out
             offset = json.loads((tmp_path / f"model.{kind}.offset.json").read_text())["offset"]
-            found = read_gaussians(path).means.double() + torch.tensor(offset, dtype=torch.float64)
-            assert (found - means).abs().max() < 0.02
+            found = read_gaussians(path)
+            assert (
+                found.means.double() + torch.tensor(offset, dtype=torch.float64) - means
+            ).abs().max() < 0.02
+            # The file is read with the offset beside it, so that another conversion keeps the place.
+            assert offset_of(found.comments) == tuple(offset)
         assert main(["export", str(whole), f"--{kind}", str(path)]) == 0
         assert not (tmp_path / f"model.{kind}.offset.json").exists()
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.distributed.run import get_args_parser
 
 from blitzgs._built import LIBRARY_DIR
 from blitzgs.cli import COMMANDS, doctor, main
@@ -31,6 +32,18 @@ def shell(script, **variables):
         ["bash", "-c", script], capture_output=True, text=True, timeout=200, env=environment
     )
     return done.returncode, done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("command", ["train", "eval", "render"])
+def test_torchrun_takes_no_flag_of_ours_for_its_own(command, capsys):
+    """Torchrun reads an abbreviation of its flags even behind the program that it starts."""
+    with pytest.raises(SystemExit, match="0"):
+        main([command, "--help"])
+    flags = set(re.findall(r"--[a-z][a-z-]*", capsys.readouterr().out)) - {"--max-restarts", "--help"}
+    assert {"--resume", "--out"} & flags
+    for flag in sorted(flags - {"--start"}):  # its help names --model.start
+        found = get_args_parser().parse_args(["-m", "blitzgs", command, flag, "1"])
+        assert found.training_script_args == [command, flag, "1"]
 
 
 FULL = "standard output cannot be written (No space left on device)"

@@ -82,6 +82,7 @@ def test_saved_configuration_reads_back_to_the_same(tmp_path):
         ("--lod.visible_threshold=1", r"lod.visible_threshold: must be in \[0, 1\), got 1.0"),
         ("--data.exif=maybe", "data.exif: must be one of auto, apply, ignore, got maybe"),
         ("--view.cull=true", "view.cull: needs population.importance=true"),
+        ("--population.importance=true --schedule.t1=9 --schedule.t2=9", "schedule.t2: the second pass"),
         ("--population.strategy=relocation --population.gate=a.json", "gate: .* relocation has none"),
         (
             "--loss.opacity=0.03 --loss.opacity_total=1",

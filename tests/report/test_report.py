@@ -192,7 +192,7 @@ def test_only_pages_of_ours_are_replaced(trained, tmp_path, failure):
     assert main(["report", str(tmp_path)]) == 1
 
 
-def test_a_report_that_fails_does_not_fail_the_training(trained, tmp_path, monkeypatch):
+def test_a_report_that_fails_does_not_fail_the_training(trained, tmp_path, monkeypatch, capsys):
     def fails(*_):
         raise KeyError("a fault")
 
@@ -200,6 +200,7 @@ def test_a_report_that_fails_does_not_fail_the_training(trained, tmp_path, monke
     flags = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.2")
     with pytest.warns(UserWarning, match="the report was not written"):
         assert main(["train", "--data", str(trained[0]), "--out", str(tmp_path / "run"), *flags]) == 0
+    assert "report:" not in capsys.readouterr().out  # it does not point to a file that is not there
 
 
 def test_warnings_come_into_the_log(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a run checks of its folder, what it shows while it works, and how it stops."""
 
+import errno
 import json
 import shutil
 import subprocess
@@ -254,6 +255,16 @@ def test_one_run_at_a_time(tmp_path, monkeypatch, failure):
     assert main(command) == 0  # a lock does not outlive its process
     with locked(out, Ranks()):
         pass
+
+
+def test_a_full_disk_is_named_by_the_check_and_not_by_the_lock(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("os.pwrite", full)
+    monkeypatch.setattr("os.fsync", full)
+    with locked(tmp_path, Ranks()), pytest.raises(FolderError, match="cannot be written: .* No space left"):
+        check_writable(tmp_path, Ranks())
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,7 @@ from blitzgs.frame.render import render_frame
 from blitzgs.population.importance import is_culled
 from blitzgs.runs import trained_model
 from blitzgs.runs.evaluation import image_metrics
+from blitzgs.runs.world import subject_of_file
 from blitzgs.table.table import CULL, GaussianTable
 from blitzgs.training import view_level
 from blitzgs.training.events import evaluate
@@ -240,7 +241,12 @@ def test_the_export_carries_the_levels(whole_run, tmp_path):
     words = line.split()
     distance = state.progress.reference_distance * state.space.unit
     assert float(words[words.index("reference_distance") + 1]) == distance
-    assert words[-4:] == ["levels", str(state.progress.level_count), "finest", "1"]
+    assert words[-6:-1] == ["levels", str(state.progress.level_count), "finest", "1", "least"]
+    # The views of the file have the gate that those of the run have.
+    lod = subject_of_file(found, state.config, state.space, Ranks()).lod
+    centres = torch.cat([state.views.centres(state.capture.train), torch.tensor([[0.0, 0.0, 1e5]]).double()])
+    gated = [flag == "1" for flag in state.progress.gated_views]
+    assert [lod.applies(share) for share in lod.kept(centres)] == [*gated, False]
     with pytest.raises(ValueError, match="levels has the shape"):
         write_ply(path, means=found.means, quats=found.quats, scales=found.scales,
                   opacities=found.opacities, sh=found.sh, levels=found.levels[1:])  # fmt: skip
