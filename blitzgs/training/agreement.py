@@ -19,10 +19,11 @@ from types import FrameType
 import torch
 
 from blitzgs.distributed.group import Ranks
-from blitzgs.ops.host import to_device
+from blitzgs.ops.host import HostCopy, to_device
 from blitzgs.runs.checkpoint import Saving
 
-# The ranks agree at least this often: in steps, and in seconds as far as single steps allow.
+# The ranks agree at least this often: in steps, and in seconds as far as single steps allow. On GPUs they
+# learn the decision one step later.
 MAX_STEPS = 16
 MAX_SECONDS = 4.0
 
@@ -77,6 +78,11 @@ class SaveClock:
         """Tell whether the time has passed."""
         return self.saving is None and time.monotonic() >= self._at
 
+    @property
+    def is_written(self) -> bool:
+        """Tell whether this rank has written its part of a checkpoint."""
+        return self.saving is not None and self.saving.is_written
+
 
 @dataclass(frozen=True)
 class Decision:
@@ -90,42 +96,67 @@ class Decision:
 
 
 class Agreement:
-    """Gives every rank the same decision after the same step."""
+    """Gives every rank the same decision after the same step.
+
+    On GPUs the requests are collected while the next step runs, so the host does not wait for them.
+    """
 
     def __init__(
         self, ranks: Ranks, stop: StopRequest, clock: SaveClock, wants: Callable[[], bool] = lambda: False
     ) -> None:
         """Prepare; `wants` returns whether those who watch the run want something of all ranks."""
         self._ranks, self._stop, self._clock, self._wants = ranks, stop, clock, wants
-        self._next = 0  # the step after which the ranks agree again
-        self._last: tuple[int, float] | None = None  # the step after which they agreed last, and when
+        self._next = 0
+        self._last: tuple[int, float] | None = None
+        # The requests of all ranks and the step after which they were collected, until they are read.
+        self._asked: tuple[int, HostCopy] | None = None
+        self._reads_late = ranks.device.type == "cuda"
+        self._agreed_to_stop = False
 
     def after(self, step: int, lost: bool = False) -> Decision:
         """Return the decision for `step`; every rank calls this after every step.
 
         `lost`: whether this rank continues without a photograph that it could not read.
         """
-        if self._ranks.world_size > 1 and step < self._next:
-            return Decision(None, False)
-        return self.now(step, lost)
+        if self._ranks.world_size == 1 or self._agreed_to_stop:
+            return self.now(step, lost)
+        if self._asked is None:
+            if step < self._next:
+                return Decision(None, False)
+            self._asked = self._ask(step, lost)
+            if self._reads_late:
+                return Decision(None, False)
+        return self._answer(step, *self._asked)
 
     def now(self, step: int, lost: bool = False) -> Decision:
         """Return a decision at once, whatever the step; every rank calls this."""
-        clock, ranks, now = self._clock, self._ranks, time.monotonic()
+        if self._ranks.world_size == 1:
+            clock = self._clock
+            return self._decision(self._stop.number, clock.is_due, clock.is_written, lost, self._wants())
+        return self._answer(step, *self._ask(step, lost))
+
+    def _ask(self, step: int, lost: bool) -> tuple[int, HostCopy]:
+        """Collect the requests of all ranks after `step`."""
+        now = time.monotonic()
         # The duration of a step is not known at first, so the ranks agree again after the next one.
         seconds = MAX_SECONDS
         if self._last is not None and step > self._last[0]:
             seconds = (now - self._last[1]) / (step - self._last[0])
-        unfinished = clock.saving is None or not clock.saving.is_written
-        requests = [self._stop.number, clock.is_due, unfinished, lost, self._wants(), seconds]
-        if ranks.world_size > 1:
-            values = to_device(torch.tensor(requests, dtype=torch.float64), ranks.device)
-            with ranks.watchdog.waiting("agree"):
-                requests = ranks.all_reduce(values, "max").tolist()
-        number, due, unwritten, any_lost, watched, slowest = requests
+        unwritten = not self._clock.is_written
+        requests = [self._stop.number, self._clock.is_due, unwritten, seconds, lost, self._wants()]
+        values = to_device(torch.tensor(requests, dtype=torch.float64), self._ranks.device)
+        return step, HostCopy(self._ranks.all_reduce(values, "max").view(torch.int64))
+
+    def _answer(self, step: int, asked: int, requests: HostCopy) -> Decision:
+        """Decide after `step` by the requests of all ranks after step `asked`; wait for them."""
+        with self._ranks.watchdog.waiting("agree"):
+            number, due, unwritten, slowest, any_lost, watched = requests.read().view(torch.float64).tolist()
+        self._asked = None
         interval = max(1, min(MAX_STEPS, int(MAX_SECONDS / max(slowest, 1e-9))))
-        self._next, self._last = (step // interval + 1) * interval, (step, time.monotonic())
-        name = None
-        if number > 0:
-            name, self._next = signal.Signals(int(number)).name, 0
-        return Decision(name, due > 0, not unwritten, any_lost > 0, watched > 0)
+        self._next, self._last = (asked // interval + 1) * interval, (step, time.monotonic())
+        self._agreed_to_stop = number > 0
+        return self._decision(int(number), due > 0, not unwritten, any_lost > 0, watched > 0)
+
+    @staticmethod
+    def _decision(number: int, due: bool, written: bool, lost: bool, watched: bool) -> Decision:
+        return Decision(signal.Signals(number).name if number else None, due, written, lost, watched)

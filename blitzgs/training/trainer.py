@@ -194,7 +194,9 @@ class Trainer:
         reasons = self.state.ranks.all_gather_object(self.loader.lost)
         lost = [f"rank {rank}: {reason}" for rank, reason in enumerate(reasons) if reason is not None]
         if lost:
-            raise PhotographError(f"{'; '.join(lost)}. The last steps, {MAX_STEPS} at most, went without it")
+            raise PhotographError(
+                f"{'; '.join(lost)}. The last steps, {MAX_STEPS + 1} at most, went without it"
+            )
 
     def _stop_by(self, signal: str | None, saves: bool = True) -> None:
         self._stop(f"stopped by {signal}; continue with --resume", saves)

@@ -120,10 +120,11 @@ def test_nohup_is_respected_and_a_second_signal_does_not_interrupt_the_save():
         signal.signal(signal.SIGHUP, before)
 
 
-def _agreements(ranks, seconds, most):
+def _agreements(ranks, seconds, most, late):
     stop, clock = StopRequest(), SaveClock(0)
     pytest.MonkeyPatch().setattr("blitzgs.training.agreement.MAX_SECONDS", most)
     agreement = Agreement(ranks, stop, clock)
+    agreement._reads_late = late
     decisions = []
     for step in range(1, 60):
         time.sleep(seconds)
@@ -141,10 +142,16 @@ def _agreements(ranks, seconds, most):
 
 
 @pytest.mark.parametrize(
-    ("seconds", "most", "stop_at", "save_at"), [(0.001, 4.0, 32, 16), (0.1, 0.25, 20, 4)]
+    ("seconds", "most", "late", "stop_at", "save_at"),
+    [
+        (0.001, 4.0, False, 32, 16),
+        (0.1, 0.25, False, 20, 4),
+        (0.001, 4.0, True, 33, 4),
+        (0.1, 0.25, True, 22, 4),
+    ],
 )
-def test_ranks_agree_after_the_same_step_and_slow_steps_do_not_wait(seconds, most, stop_at, save_at):
-    first, second = run_ranks(_agreements, 2, seconds, most)
+def test_ranks_agree_after_the_same_step_and_slow_steps_do_not_wait(seconds, most, late, stop_at, save_at):
+    first, second = run_ranks(_agreements, 2, seconds, most, late)
     assert first == second
     assert [step for step, (_, saves) in enumerate(first, 1) if saves] == [save_at]
     assert len(first) == stop_at and first[-1][0] == "SIGTERM"
@@ -157,17 +164,19 @@ class TwoRanks(Ranks):
         return tensor
 
 
-def test_a_lost_photograph_ends_the_run_in_time(monkeypatch):
+@pytest.mark.parametrize("late", [False, True])
+def test_a_lost_photograph_ends_the_run_in_time(monkeypatch, late):
     """The first steps are slow, so that the ranks agree after steps of any remainder."""
     for slow, at in itertools.product(range(2, 20), range(20, 60)):
         now = [0.0]
         monkeypatch.setattr(time, "monotonic", lambda now=now: now[0])
         agreement = Agreement(TwoRanks(world_size=2), StopRequest(), SaveClock(0))
+        agreement._reads_late = late
         for step in range(1, 100):
             now[0] += 1.0 if step < slow else 0.001
             if agreement.after(step, lost=step >= at).lost:
                 break
-        assert at <= step < at + MAX_STEPS
+        assert at <= step < at + MAX_STEPS + late
 
 
 # Photographs, disks and terminals that disappear.
