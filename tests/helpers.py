@@ -257,7 +257,11 @@ def sum_parts(parts: Tensor) -> tuple[Tensor, Tensor]:
 
 def save_checkpoint(*arguments: Any, **options: Any) -> Path:
     """Write a checkpoint and delete older ones, as `Saving` and with its arguments; return its folder."""
-    return Saving(*arguments, **options).finish()
+    saving = Saving(*arguments, **options)
+    path = saving.finish()
+    if saving.deleting is not None:
+        saving.deleting.join()
+    return path
 
 
 def export_ply(model: Model, path: Path, coordinates: str = "auto", crs: str = "") -> Exported:

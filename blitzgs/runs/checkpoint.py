@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Thread
 from typing import Any, TypeVar
 
 import torch
@@ -85,6 +86,7 @@ class Saving:
         device = next(iter(columns.values())).device
         ready = torch.cuda.current_stream(device).record_event() if device.type == "cuda" else None
         pool = ThreadPoolExecutor(1, "blitzgs-checkpoint")
+        self.deleting: Thread | None = None  # deletes older checkpoints on rank 0, after `finish`
         self._written = pool.submit(self._write, columns, shared or {}, device, ready)
         pool.shutdown(wait=False)
 
@@ -153,8 +155,7 @@ class Saving:
             )
         if ranks.rank == 0:
             try:
-                with ranks.watchdog.working("deleting older checkpoints"):
-                    _delete_old(self._directory, self._keep)
+                self.deleting = _delete_old(self._directory, self._keep)
             except OSError as error:
                 # The new checkpoint is complete; the next save tries to delete the old ones again.
                 warn(f"an older checkpoint could not be deleted: {error}")
@@ -263,12 +264,15 @@ def _explain(error: OSError) -> str:
     return str(error)
 
 
-def _delete_old(directory: Path, keep: int) -> None:
-    """Delete all but the newest `keep`."""
+def _delete_old(directory: Path, keep: int) -> Thread:
+    """Start to delete all but the newest `keep`: deleting gigabytes takes seconds."""
     for name in names_of(directory)[:-keep]:
         # Rename first: an interrupted deletion must not leave half a checkpoint under a final name.
         (directory / name).rename(directory / (_UNFINISHED + name))
-    _delete(directory.glob(_UNFINISHED + "*"))
+    # The next save makes a folder that is not among these.
+    deleting = Thread(target=_delete, args=(list(directory.glob(_UNFINISHED + "*")),))
+    deleting.start()
+    return deleting
 
 
 def _delete(folders: Iterable[Path]) -> None:
