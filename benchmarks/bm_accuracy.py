@@ -34,8 +34,6 @@ from report_tables import accuracy_lines
 from scenes import BenchmarkScene, aerial
 from torch import Tensor
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.render import Frame, RenderOptions, render_frame
 from blitzgs.frame.tiles import TileAssignment, TileRanges
@@ -44,7 +42,7 @@ from blitzgs.frame.transport.protocol import LocalTransport, Transport
 from blitzgs.ops.intersect import tile_counts
 from blitzgs.ops.projection_types import Views
 from blitzgs.reference import Composite, Splats, composite, project_splats
-from blitzgs.table.table import PARAMETERS, GaussianTable, schema
+from blitzgs.table.table import PARAMETERS, GaussianTable
 from tests.helpers import parameter_gradients
 
 IMAGE_BOUND, GRADIENT_BOUND = 2e-5, 1e-4  # largest errors of the default setting
@@ -176,12 +174,7 @@ class Renderer:
     def __init__(self, scene: BenchmarkScene, option: Option) -> None:
         device = scene.means.device
         raw = scene.raw()
-        n = len(scene.means)
-        columns = {
-            name: torch.zeros(n, *column.shape, dtype=column.dtype, device=device)
-            for name, column in schema(3).items()
-        }
-        self.table = GaussianTable(columns | {"id": torch.arange(n, device=device)})
+        self.table = GaussianTable.create(raw)
         for name in PARAMETERS:
             self.table[name] = raw[name].to(option.dtype)
         viewmats, Ks = scene.viewmats.to(option.dtype), scene.Ks.to(option.dtype)
@@ -206,16 +199,12 @@ class Renderer:
             self.table, self.views, self.options, assignment=self.assignment, transport=self.transport
         )
 
-    def backward(self, frame: Frame, v_renders: Tensor) -> list[Tensor]:
-        """Return the gradients of the visible Gaussians."""
-        return parameter_gradients(self.table, frame, v_renders)
-
     def step_ms(self, repeats: int) -> float:
         """Return the milliseconds of forward and backward, per view."""
         v_renders = torch.randn_like(self.forward().renders)
 
         def step(mark: Callable[[str], None]) -> None:
-            self.backward(self.forward(), v_renders)
+            parameter_gradients(self.table, self.forward(), v_renders)
             mark("step")
 
         return stage_medians(step, repeats, device=v_renders.device)[-1][1] / len(self.views)
@@ -242,7 +231,7 @@ def errors(scene: BenchmarkScene, renderer: Renderer) -> tuple[float, float, flo
         weights = torch.randn(image.shape, generator=generator, dtype=torch.float64) * keep[..., None]
         expected_loss = expected_loss + (image * weights).sum()
         v_renders[place] += weights.to(v_renders)
-    actual = renderer.backward(frame, v_renders)
+    actual = parameter_gradients(renderer.table, frame, v_renders)
     expected = torch.autograd.grad(expected_loss, exact.inputs, retain_graph=True)
     return (
         image_error,

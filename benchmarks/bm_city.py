@@ -32,10 +32,10 @@ from typing import Any
 
 import quality_report
 import torch
-from bm_quality import Pool, positive, work
+from bm_quality import Pool, work
 from city_report import TABLES
 from city_run import RESERVE, CityRun
-from harness import ROOT, command_line, make_parser, markdown_table, write_json
+from harness import ROOT, command_line, make_parser, markdown_table, positive, write_json
 from quality_plan import parse_named, runs_of
 
 CONFIG = ROOT / "configs" / "city.yaml"

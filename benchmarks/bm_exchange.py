@@ -44,7 +44,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TILE_COST, TileOwners
 from blitzgs.frame.render import RenderOptions
 from blitzgs.frame.tiles import LOSS_HALO, TileRanges
-from blitzgs.frame.transport.protocol import Traffic, stages_told_to
+from blitzgs.frame.transport.protocol import stages_told_to
 from blitzgs.ops.projection_types import Views
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import octree_gaussians
@@ -132,10 +132,11 @@ class Workload:
         frame, terms, sums = self.stepper.forward(self.steps, self.options, batch)
         self.guard.check(self.steps, [str(key) for key in batch.indices], sums, self.table, frame)
         self.stepper.backward(self.steps, frame, terms)
+        sent = () if frame.way_back is None else frame.way_back.traffic.sent
         return {
             "splats": len(frame.projected.gaussian_ids),
             "visible": len(frame.projected.visible_ids),
-            "sent": 0 if frame.way_back is None else _sent_elsewhere(frame.way_back.traffic, self.ranks.rank),
+            "sent": sum(sent) - sent[self.ranks.rank] if sent else 0,
             "work": sums,
             "ranges": batch.ranges,
         }
@@ -171,10 +172,6 @@ def balance_of(result: dict[str, Any]) -> float:
     cost = result["work"].read()[-ranges.n_views * ranges.tiles_per_view :].double() + TILE_COST
     parts = [cost[begin:end].sum().item() for begin, end in pairwise(ranges.bounds)]
     return max(parts) / statistics.mean(parts)
-
-
-def _sent_elsewhere(traffic: Traffic, rank: int) -> int:
-    return sum(traffic.sent) - traffic.sent[rank]
 
 
 def measure(args: argparse.Namespace) -> None:

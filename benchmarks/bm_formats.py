@@ -21,8 +21,6 @@ import psutil
 import torch
 from harness import make_parser, write_json
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import Gaussians
 from blitzgs.formats.models import FORMATS, read_gaussians

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import contextlib
 import statistics
-import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -38,9 +37,6 @@ from blitzgs import l1_ssim, rasterization, raw_rasterization
 from blitzgs.distributed.group import Ranks
 from blitzgs.optim import LazyAdam
 from blitzgs.training.trainer import Trainer as Training
-
-sys.path.append(str(Path(__file__).parents[1]))
-
 from tests.training.tiny import tiny_config, tiny_scene
 
 GAUSSIANS, WIDTH, HEIGHT = 50, 32, 32

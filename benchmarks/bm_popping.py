@@ -21,6 +21,7 @@ from __future__ import annotations
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -129,12 +130,12 @@ class _Flight:
 
     def figures(self) -> dict[str, float]:
         """Return the figures of this way to render, as `popping` returns them."""
-        found = {"mean_change": _mean(self._changes), "largest_change": max(self._changes)}
+        found = {"mean_change": fmean(self._changes), "largest_change": max(self._changes)}
         if self._lod is None:
             return found
         pixel = float(self._worst.topk(max(1, len(self._worst) // 1000)).values[-1])
-        popped = {"mean": _mean(self.popping), "largest": max(self.popping), "pixel": pixel}
-        return found | popped | {"kept": _mean(self._kept)}
+        popped = {"mean": fmean(self.popping), "largest": max(self.popping), "pixel": pixel}
+        return found | popped | {"kept": fmean(self._kept)}
 
     def _active(self, viewmats: Tensor) -> ActiveRows | None:
         return None if self._lod is None else self._lod.active(self._model.table, viewmats)
@@ -154,10 +155,6 @@ class _Flight:
     ) -> Tensor:
         views = Views(viewmats, self._K.to(viewmats.device)[None], *self._size)
         return render_frame(table, views, options, active).renders[0].clamp(0, 1)
-
-
-def _mean(values: list[float]) -> float:
-    return sum(values) / len(values)
 
 
 def _gate(model: TrainedModel, smooth: bool, ranks: Ranks) -> ModelGate:

@@ -43,7 +43,6 @@ from typing import Any, TextIO
 
 import harness
 import quality_report
-import torch
 from quality_plan import STRESS_SEEDS, RunSpec, end_of, parse_named, runs_of, stress_markdown, stress_recipes
 from quality_run import describe, write
 
@@ -208,17 +207,9 @@ def train(specs: Sequence[RunSpec], pool: Pool, minutes: float | None) -> int:
     return int(any(run["status"] != "done" and run["name"] in wanted for run in runs))
 
 
-def positive(text: str) -> int:
-    """Read a number of at least 1."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, got {value}")
-    return value
-
-
 def make_parser() -> argparse.ArgumentParser:
     parser = harness.make_parser(__doc__, device=None, writes_json=False)
-    parser.add_argument("--out", type=Path, required=True, metavar="RESULTS", help="folder of the results")
+    harness.add_pool_flags(parser)
     parser.add_argument("--capture", action="append", default=[], metavar='"NAME=DIR [--data.FIELD=VALUE]"')
     parser.add_argument("--recipe", action="append", default=[], metavar='"NAME=SOURCE [--FIELD=VALUE]"')
     parser.add_argument("--seeds", type=int, nargs="+", help="of the trainings (default: 0)")
@@ -226,24 +217,19 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--only", metavar="REGEX", default="", help="of recipes, those whose names have this")
     parser.add_argument(
         "--evaluate-at",
-        type=positive,
+        type=harness.positive,
         nargs="*",
         default=list(EVALUATE_AT),
         metavar="IMAGES",
         help="measure held-out views after so many images, and at the end (%(default)s)",
     )
     parser.add_argument(
-        "--lpips", type=Path, metavar="FILE", help="TorchScript module of LPIPS with its weights"
+        "--ranks",
+        type=harness.positive,
+        default=1,
+        metavar="N",
+        help="GPUs that train a run (%(default)s)",
     )
-    gpus = torch.cuda.device_count()
-    parser.add_argument(
-        "--gpus", type=int, default=gpus, metavar="N", help="to use; 0: the CPU (%(default)s)"
-    )
-    parser.add_argument("--per-gpu", type=positive, default=1, metavar="N", help="runs on each (%(default)s)")
-    parser.add_argument(
-        "--ranks", type=positive, default=1, metavar="N", help="GPUs that train each run (%(default)s)"
-    )
-    parser.add_argument("--minutes", type=float, metavar="M", help="start no run later than this")
     parser.add_argument(
         "--collect", type=Path, nargs="*", metavar="SOURCE",
         help="add these runs; without recipes, report alone",

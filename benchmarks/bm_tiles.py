@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,8 +22,6 @@ import numpy as np
 import torch
 from harness import make_parser, report
 from torch import Tensor
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from blitzgs import rasterization
 from blitzgs.view.draw import intrinsics

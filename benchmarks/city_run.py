@@ -63,7 +63,6 @@ class CityTrainer(Trainer):
 
     def _stop(self, reason: str, saves: bool = True) -> None:
         """Write no checkpoint of a stopped run: it takes longer than the time that is left."""
-        self._write_record()
 
 
 def phases_of(config: Config, records: Sequence[Record], images: int, seconds: float) -> list[Record]:

@@ -22,6 +22,7 @@ from typing import Any
 import torch
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.append(str(ROOT))  # of the helpers that benchmarks share with the tests
 WARM_UP = 5  # steps before those that count
 BEST_DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
@@ -37,15 +38,9 @@ def environment(device: torch.device | str = "cpu") -> dict[str, Any]:
     if torch.device(device).type == "cuda":
         info["device"] = torch.cuda.get_device_name(device)
         info["cuda"] = str(torch.version.cuda)
-    if (version := gsplat_version()) is not None:
-        info["gsplat"] = version
+    if (gsplat := sys.modules.get("gsplat")) is not None:
+        info["gsplat"] = str(getattr(gsplat, "__version__", "of unknown version"))
     return info
-
-
-def gsplat_version() -> str | None:
-    """Return the version of gsplat; None if this process has not imported it."""
-    module = sys.modules.get("gsplat")
-    return None if module is None else str(getattr(module, "__version__", "of unknown version"))
 
 
 def commit() -> str:
@@ -141,6 +136,26 @@ def make_parser(
     if writes_json:
         parser.add_argument("--json", type=Path, help="write the results, commit and machine to this file")
     return parser
+
+
+def positive(text: str) -> int:
+    """Read a number of at least 1."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, got {value}")
+    return value
+
+
+def add_pool_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the commands that train runs side by side (`bm_quality.Pool`)."""
+    parser.add_argument("--out", type=Path, required=True, metavar="RESULTS", help="folder of the results")
+    gpus = torch.cuda.device_count()
+    parser.add_argument(
+        "--gpus", type=int, default=gpus, metavar="N", help="to use; 0: the CPU (%(default)s)"
+    )
+    parser.add_argument("--per-gpu", type=positive, default=1, metavar="N", help="runs on each (%(default)s)")
+    parser.add_argument("--lpips", type=Path, metavar="FILE", help="TorchScript module of LPIPS with weights")
+    parser.add_argument("--minutes", type=float, metavar="M", help="start no run later than this")
 
 
 def report(

@@ -17,8 +17,6 @@ from torch import Tensor
 
 from blitzgs.formats.gaussians import SH_C0
 
-SH_COEFFICIENTS = 16  # degree 3
-
 
 @dataclass(frozen=True)
 class BenchmarkScene:
@@ -253,7 +251,7 @@ def _quaternion_product(a: Tensor, b: Tensor) -> Tensor:
 
 def _spherical_harmonics(colors: Tensor, generator: torch.Generator) -> Tensor:
     """Return degree-3 coefficients [N, 16, 3] with mean colour `colors` and bands of 0.06, 0.04 and 0.03."""
-    sh = torch.randn(len(colors), SH_COEFFICIENTS, 3, generator=generator, device=colors.device)
+    sh = torch.randn(len(colors), 16, 3, generator=generator, device=colors.device)
     bands = torch.tensor([0.0] + 3 * [0.06] + 5 * [0.04] + 7 * [0.03], device=colors.device)
     sh *= bands[:, None]
     sh[:, 0] = (colors - 0.5) / SH_C0

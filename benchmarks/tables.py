@@ -41,7 +41,6 @@ import bm_quality
 import harness
 import quality_report
 import tables_report
-import torch
 import yaml
 from quality_plan import parse_named, runs_of
 
@@ -179,7 +178,7 @@ def tabulate(table: str, plan: dict[str, Any], out: Path) -> str:
 def make_parser() -> argparse.ArgumentParser:
     parser = harness.make_parser(__doc__, device=None, writes_json=False)
     parser.add_argument("table", choices=TABLES)
-    parser.add_argument("--out", type=Path, required=True, metavar="TABLES", help="folder of the results")
+    harness.add_pool_flags(parser)
     parser.add_argument("--scenes", nargs="+", default=[], metavar='"NAME=DIR [--data.FIELD=VALUE]"')
     parser.add_argument("--runs", nargs="+", default=[], metavar="NAME=RUN", help="for oracle and popping")
     parser.add_argument(
@@ -189,16 +188,9 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--arms", nargs="+", metavar="ARM", help="only these, by their names in the plan")
     parser.add_argument("--gate", type=Path, metavar="FILE", help="spawn gate, fitted on other scenes")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    gpus = torch.cuda.device_count()
     parser.add_argument(
-        "--gpus", type=int, default=gpus, metavar="N", help="to use; 0: the CPU (%(default)s)"
+        "--ranks", type=harness.positive, nargs="+", default=[1, 2, 4], help="of scaling and cost"
     )
-    parser.add_argument("--per-gpu", type=bm_quality.positive, default=1, metavar="N", help="runs on each")
-    parser.add_argument(
-        "--ranks", type=bm_quality.positive, nargs="+", default=[1, 2, 4], help="of scaling and cost"
-    )
-    parser.add_argument("--lpips", type=Path, metavar="FILE", help="as for bm_quality.py")
-    parser.add_argument("--minutes", type=float, metavar="M", help="start no run later than this")
     parser.add_argument("--collect", type=Path, nargs="+", default=[], metavar="SOURCE")
     parser.add_argument("--resume", action="store_true", help="carry on in a folder that has results")
     parser.add_argument("--dry-run", action="store_true", help="list the runs, and stop")

@@ -25,23 +25,15 @@ except ImportError:  # websocket-client, of the extra test
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
-def chromium() -> str | None:
-    """Return the path of an installed Chromium; None: there is none."""
-    return next((path for name in NAMES if (path := shutil.which(name))), None)
-
-
-needs_chromium = pytest.mark.skipif(
-    chromium() is None or websocket is None,
-    reason="Chromium or websocket-client is missing: install them (Debian: apt-get install chromium)",
-)
-
-
 class Browser:
-    """One page of a headless Chromium, with WebGL on the CPU."""
+    """One page of a headless Chromium, with WebGL on the CPU; without Chromium, the test is skipped."""
 
     def __init__(self, url: str, width: int = 1280, height: int = 720):
-        program = chromium()
-        assert program is not None, "Chromium is missing: install it (Debian: apt-get install chromium)"
+        program = next((path for name in NAMES if (path := shutil.which(name))), None)
+        if program is None or websocket is None:
+            pytest.skip(
+                "Chromium or websocket-client is missing: install them (Debian: apt-get install chromium)"
+            )
         self.folder = tempfile.mkdtemp(prefix="browser_")
         self.process = subprocess.Popen(
             [

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from blitzgs.cli import main
+from tests.helpers import BACKENDS, DEVICES
 from tests.training.tiny import OVERRIDES, as_flags, write_tiny_capture
 
 # Folders of tests with tiny trainings.
@@ -20,6 +21,14 @@ LINEAGE = (
     "schedule.t1=40", "schedule.t2=90", "schedule.gate_from=60", "schedule.checkpoint_every=50",
     "log.keep_checkpoints=9",
 )  # fmt: skip
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items):
+    """Skip the tests that need a CUDA device where there is none."""
+    for item in items:
+        if item.get_closest_marker("cuda") and not torch.cuda.is_available():
+            item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -38,6 +47,18 @@ def one_thread(request):
         torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(params=DEVICES)
+def device(request):
+    """Run a test on the CPU and on the GPU."""
+    return request.param
+
+
+@pytest.fixture(params=BACKENDS)
+def backend(request):
+    """Run a test on each device, in each dtype of its kernels: (device, dtype)."""
+    return request.param
 
 
 @pytest.fixture

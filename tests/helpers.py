@@ -32,14 +32,12 @@ from blitzgs.table.table import GaussianTable
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors", "viewmats")
 
-needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-_CUDA_MARKS = [pytest.mark.cuda, needs_cuda]
-DEVICES = ["cpu", pytest.param("cuda", marks=_CUDA_MARKS)]
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 # Where the kernels run, and in which dtype.
 BACKENDS = [
     pytest.param(("cpu", torch.float64), id="cpu-float64"),
     pytest.param(("cpu", torch.float32), id="cpu-float32"),
-    pytest.param(("cuda", torch.float32), id="cuda-float32", marks=_CUDA_MARKS),
+    pytest.param(("cuda", torch.float32), id="cuda-float32", marks=pytest.mark.cuda),
 ]
 
 

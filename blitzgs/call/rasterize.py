@@ -19,13 +19,7 @@ from blitzgs.call.arguments import (
     gaussians_of,
 )
 from blitzgs.call.channels import ImageOptions, background_rows
-from blitzgs.call.extras import (
-    check_without_ut,
-    checked_pixels,
-    with_covariances,
-    with_lenses,
-    with_signals,
-)
+from blitzgs.call.extras import check_without_ut, checked_pixels, with_covariances, with_lenses, with_signals
 from blitzgs.call.images import render
 from blitzgs.call.ranks import gather_views
 from blitzgs.util.errors import explain_memory

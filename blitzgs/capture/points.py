@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from blitzgs.capture import colmap
 from blitzgs.capture.cameras import Float64, camera_centres
-from blitzgs.capture.names import unified
+from blitzgs.capture.names import any_case
 from blitzgs.capture.transforms import Transforms
 from blitzgs.formats.ply import read_point_cloud
 from blitzgs.util.errors import optional_package, warn
@@ -193,8 +193,9 @@ def _model_points(root: Path, content: Transforms, folder: Path) -> SourcePoints
 
 def _differs(model: colmap.ColmapModel, content: Transforms) -> str | None:
     """Return why the cameras of a model and of transforms.json are not known to be the same."""
-    places = {_stem(frame.name): frame for frame in content.frames}
-    pairs = [(i, places[stem]) for i, n in enumerate(model.images.names) if (stem := _stem(n)) in places]
+    places = {PurePosixPath(any_case(frame.name)).stem: frame for frame in content.frames}
+    stems = [PurePosixPath(any_case(name)).stem for name in model.images.names]
+    pairs = [(i, places[stem]) for i, stem in enumerate(stems) if stem in places]
     if len(pairs) < 2 or len(places) < len(content.frames):
         return "its images are called otherwise than the frames, so their worlds cannot be compared"
     ours = camera_centres(np.stack([frame.world_to_camera for _, frame in pairs]))
@@ -204,7 +205,3 @@ def _differs(model: colmap.ColmapModel, content: Transforms) -> str | None:
     if not apart <= _SAME_PLACE * spread:  # NaN too
         return f"its cameras are elsewhere, {apart:.3g} apart, so its world is another one"
     return None
-
-
-def _stem(name: str) -> str:
-    return PurePosixPath(unified(name).casefold()).stem

@@ -22,7 +22,7 @@ from types import FrameType
 from typing import cast
 
 from blitzgs import __version__
-from blitzgs.cli.arguments import HelpFormatter, Parser, check_given_once, flag_meant, split_fields
+from blitzgs.cli.arguments import HelpFormatter, Parser, check_given_once, flag_meant
 from blitzgs.cli.output import report_lost, surviving_output
 from blitzgs.util.errors import UserError, printable
 
@@ -89,12 +89,11 @@ def _run(given: list[str]) -> int:
     )
     try:
         with _importing(name):
-            parser, commands = parser_of([chosen])
-        command = commands.get(chosen)
+            parser, _ = parser_of([chosen])
         if not given:
             parser.print_help(sys.stderr)
             return 2
-        args = _arguments(parser, command, chosen, given)
+        args = _arguments(parser, chosen, given)
         return cast(Callable[[argparse.Namespace], int | None], args.run)(args) or 0
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
@@ -113,23 +112,22 @@ def _run(given: list[str]) -> int:
         return 1
 
 
-def _arguments(parser: Parser, command: Parser | None, chosen: str, given: list[str]) -> argparse.Namespace:
+def _arguments(parser: Parser, chosen: str, given: list[str]) -> argparse.Namespace:
     """Parse the command line; exit with status 2 if it is wrong."""
-    at = given.index(chosen) + 1 if command is not None else len(given)
-    own = given[at:]
-    fields: list[str] = []
-    if command is not None and chosen == "train":
-        own, fields = split_fields(command, own)
-    args, unknown = parser.parse_known_args([*given[:at], *own])
+    args, unknown = parser.parse_known_args(given)
     parser_of = getattr(args, "parser", parser)
+    if chosen == "train":
+        # The configuration says what may have been meant by a field without its section.
+        fields = [text for text in unknown if re.match("--.*=", text) and not flag_meant(parser_of, text)]
+        args.overrides += fields
+        unknown = [text for text in unknown if text not in fields]
     if unknown:
         meant = flag_meant(parser_of, unknown[0])
         hint = f"; did you mean {meant}?" if meant else ""
         if chosen == "train" and not meant:
             hint = " (configuration fields are written --section.field=value)"
         parser_of.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
-    check_given_once(parser_of, [*own, *fields])
-    args.overrides = fields
+    check_given_once(parser_of, given)
     return args
 
 

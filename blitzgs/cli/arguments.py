@@ -176,37 +176,6 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {printable(message)} ({self.prog} --help explains all)\n")
 
 
-def split_fields(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return a command's arguments without configuration fields, and these as "--section.field=value".
-
-    A field is a flag with a dot, or one that the command does not have and that has a value after "=". Its
-    value follows after "=" or as the next argument.
-    """
-    others: list[str] = []
-    fields: list[str] = []
-    known = flags_of(parser)
-    waiting = list(arguments)
-    while waiting:
-        text = waiting.pop(0)
-        name, equals, _ = text.partition("=")
-        if text == "--":
-            return [*others, text, *waiting], fields
-        if not name.startswith("--") or name in known or not (equals or "." in name):
-            others.append(text)
-            # The value of a flag is no field, even if it looks like one.
-            if name in known and not equals and known[name] and waiting and not waiting[0].startswith("--"):
-                others.append(waiting.pop(0))
-        elif equals:
-            if "." not in name and (meant := flag_meant(parser, name)):
-                parser.error(f"unrecognized arguments: {text}; did you mean {meant}?")
-            fields.append(text)
-        elif waiting and not waiting[0].startswith("--"):
-            fields.append(f"{text}={waiting.pop(0)}")
-        else:
-            parser.error(f"{text} needs a value: write {text}=VALUE")
-    return others, fields
-
-
 def check_given_once(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> None:
     """Refuse a value that is given twice, of which the last one would win without a word."""
     seen: set[str] = set()
@@ -231,10 +200,10 @@ def flags_of(parser: argparse.ArgumentParser) -> dict[str, bool]:
 
 
 def flag_meant(parser: argparse.ArgumentParser, text: str) -> str | None:
-    """Return the command's flag that an unknown one resembles; None for a field and if no flag is like it."""
+    """Return the command's flag that an unknown one resembles; None if no flag is like it."""
     name = text.partition("=")[0]
     flags = list(flags_of(parser))
-    if not name.startswith("--") or "." in name:
+    if not name.startswith("--"):
         return None
     if len(longer := [flag for flag in flags if flag.startswith(name)]) == 1:
         return longer[0]

@@ -8,8 +8,7 @@ from collections.abc import Iterator
 
 from blitzgs.cli import COMMANDS, parser_of
 from blitzgs.cli.arguments import Commands, add_command
-from blitzgs.config.fields import Config
-from blitzgs.config.files import flat, to_dict
+from blitzgs.config.files import REMOVED
 
 HELP = """\
 Print a script that lets the Tab key complete commands, flags and fields of the configuration:
@@ -55,8 +54,6 @@ def run(args: argparse.Namespace) -> None:
 def script(shell: str) -> str:
     """Return the script for a shell."""
     commands = parser_of(COMMANDS)[1]
-    for field in flat(to_dict(Config())):
-        commands["train"].add_argument(f"--{field}", help="a field")
     if shell == "fish":
         return "\n".join(line for name, parser in commands.items() for line in _fish(name, parser))
     flags, choices = [], []
@@ -82,7 +79,11 @@ def _after(parser: argparse.ArgumentParser) -> tuple[list[str], dict[str, argpar
         if isinstance(action, argparse._SubParsersAction):
             for each in action.choices.values():
                 flags |= _after(each)[1]
-        flags |= {flag: action for flag in action.option_strings if flag.startswith("--")}
+        flags |= {
+            flag: action
+            for flag in action.option_strings
+            if flag.startswith("--") and flag[2:] not in REMOVED
+        }
     return words, flags
 
 
@@ -99,7 +100,8 @@ def _fish(name: str, parser: argparse.ArgumentParser) -> Iterator[str]:
     for flag, action in flags.items():
         few = _choices(action)
         value = f" -x -a {_quoted(' '.join(few))}" if few else " -r" * (action.nargs != 0)
-        meaning = (action.help or "").partition(";")[0].replace("%", "")
+        meaning = "a field" if action.help == argparse.SUPPRESS else (action.help or "")
+        meaning = meaning.partition(";")[0].replace("%", "")
         yield f"{used} -l {flag[2:]}{value} -d {_quoted(meaning)}"
 
 

@@ -219,13 +219,11 @@ def _version(text: str) -> tuple[int, ...]:
 
 
 def _torch() -> Line:
-    # The lowest that works, and the first that is not tested, where the installed package states them.
-    wanted = next((text for text in _requirements() if re.match(r"torch\b", text)), "")
-    bounds = dict(sorted(re.findall(r"(>=|<)\s*([\d.]+)", wanted), reverse=True))
-    limits = ",".join(f"{sign}{version}" for sign, version in bounds.items())
-    install = f"pip install 'torch{limits}'" if bounds else "pip install torch"
+    # The installed package may state the lowest version that works, and the first that is not tested.
+    wanted = next((text for text in _requirements() if re.match(r"torch\b", text)), "torch")
+    bounds, install = dict(re.findall(r"(>=|<)\s*([\d.]+)", wanted)), f"pip install '{wanted}'"
     try:
-        found = probe("torch")
+        found = probe("torch_")
     except ProbeError as error:
         missing = "No module named 'torch'" in str(error)
         return Line("torch", "missing" if missing else "failed", str(error), install)

@@ -14,13 +14,11 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    from blitzgs.reference.render import ReferenceImage
 
 
 REPORT = "report this with `blitzgs doctor --json`"
@@ -105,11 +103,15 @@ def render(device: str) -> dict[str, Any]:
     """Render a small scene and differentiate it, and compare both with the float64 reference."""
     import torch
 
+    from blitzgs.reference.render import render as render_reference
+
     tensors = [tensor.to(device).requires_grad_() for tensor in _scene()]
     viewmat, K = (tensor.to(device) for tensor in _camera(0))
     begin = time.perf_counter()
     images = _rendered(tensors, viewmat, K, False)
-    leaves, reference = _reference()
+    leaves = [tensor.double().requires_grad_() for tensor in _scene()]
+    by_definition: Any = render_reference
+    reference = by_definition(*leaves, *_camera(0), _WIDTH, _HEIGHT, sh_degree=1)
     weights = torch.randn(reference.image.shape, generator=_generator(), dtype=torch.float64)
     weights[reference.cut] = 0  # where rounding decides whether a Gaussian counts
     (images[0].double().cpu() * weights).sum().backward()
@@ -235,22 +237,7 @@ def _rendered(scene: list[Tensor], viewmat: Tensor, K: Tensor, distributed: bool
     return render(*scene, *view, sh_degree=1, distributed=distributed)[0]
 
 
-def _reference() -> tuple[list[Tensor], ReferenceImage]:
-    from blitzgs.reference.render import render as render_reference
-
-    leaves = [tensor.double().requires_grad_() for tensor in _scene()]
-    render: Any = render_reference
-    return leaves, render(*leaves, *_camera(0), _WIDTH, _HEIGHT, sh_degree=1)
-
-
-PROBES: dict[str, Callable[..., dict[str, Any]]] = {
-    "torch": torch_,
-    "library": library,
-    "render": render,
-    "exchange": exchange,
-    "nccl": nccl,
-    "disk": disk,
-}
+_PROBES = {probe.__name__: probe for probe in (torch_, library, render, exchange, nccl, disk)}
 
 if __name__ == "__main__":
-    print(json.dumps(PROBES[sys.argv[1]](*sys.argv[2:])))
+    print(json.dumps(_PROBES[sys.argv[1]](*sys.argv[2:])))

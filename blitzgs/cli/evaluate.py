@@ -12,7 +12,7 @@ from blitzgs.cli import arguments
 from blitzgs.config.fields import Config, DataConfig, ModelConfig
 from blitzgs.config.files import changed
 from blitzgs.distributed.group import Ranks
-from blitzgs.formats.gaussians import Gaussians, is_antialiased
+from blitzgs.formats.gaussians import is_antialiased
 from blitzgs.formats.models import read_gaussians
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files, trained_model
@@ -46,6 +46,7 @@ FLAGS = """
     [1, 3, H, W] in [-1, 1], and returns their distance
 --allow-missing  leave out views whose photograph is missing
 """
+_COUNT = arguments.number(int, lambda value: value >= 0, "0 or more")
 _FACTOR = arguments.number(int, lambda value: value >= 1, "a whole number from 1 on")
 
 
@@ -57,19 +58,22 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
     arguments.add_device(parser, shares_gpus=True)
     arguments.add_pool(parser)
     arguments.add_split(parser, "measure")
-    arguments.add_flags(parser, FLAGS, {"--downscale": _FACTOR, "--pictures": int, "--lpips": str})
+    arguments.add_flags(parser, FLAGS, {"--downscale": _FACTOR, "--pictures": _COUNT, "--lpips": str})
     parser.set_defaults(pictures=8)
 
 
 def run(args: argparse.Namespace) -> None:
     """Measure the views of a run."""
-    if args.pictures < 0:
-        raise ValueError(f"--pictures: must be 0 or more, got {args.pictures}")
     with Ranks.from_environment(args.device, share_gpus=args.share_gpus) as ranks:
         path: Path = args.model
         if path.is_file():
             found = read_gaussians(path)
-            config = _config_of(found, args.data, args.downscale)
+            if args.data is None:
+                raise ValueError("a file is compared with a capture: add --data CAPTURE")
+            config = Config(
+                data=DataConfig(path=str(args.data), downscale=args.downscale or 1),
+                model=ModelConfig(antialiased=is_antialiased(found)),
+            )
         else:
             if args.downscale is not None:
                 raise ValueError("--downscale is for a file: a run is measured at the size it was trained at")
@@ -113,13 +117,3 @@ def run(args: argparse.Namespace) -> None:
                 print(printable(f"among the worst views: {view} {psnr:.2f} dB"), file=sys.stderr)
             what = f"metrics.json and pictures; {len(indices)} views, {largest_size(capture)} pixels"
             print(f"{folder}: {what}", file=sys.stderr)
-
-
-def _config_of(found: Gaussians, data: Path | None, downscale: int | None) -> Config:
-    """Return the configuration that shows a file in the views of a capture."""
-    if data is None:
-        raise ValueError("a file is compared with a capture: add --data CAPTURE")
-    return Config(
-        data=DataConfig(path=str(data), downscale=downscale or 1),
-        model=ModelConfig(antialiased=is_antialiased(found)),
-    )

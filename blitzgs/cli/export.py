@@ -96,12 +96,13 @@ FLAGS = f"""
 SELECTION = """
 --crop-polygon FILE  keep this region: a GeoJSON polygon, or lines "x y", in the coordinates of --crop
 --min-opacity O  keep Gaussians of at least this opacity
---most N  keep the N Gaussians that contribute most to views of the capture (of a file: of the largest opacity
-    times length)
+--most N  keep the N Gaussians that contribute most to views of the capture (of a file, and in tiles and
+    streamed SOG: of the largest opacity times length)
 --levels FIRST-LAST  keep these octree levels, for example 0-3
 """
 _TILES = "--tiles and --streamed-sog"
 _COUNT = arguments.number(int, lambda value: value >= 1, "a whole number from 1 on")
+_OPACITY = arguments.number(float, lambda value: 0 <= value < 1, "from 0 to below 1")
 _MB = arguments.number(float, lambda mb: 0 < mb <= LARGEST_MB, f"a number of megabytes up to {LARGEST_MB}")
 
 
@@ -125,7 +126,7 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
     )
     parser.add_argument(
         "--clean",
-        type=int,
+        type=_COUNT,
         nargs="?",
         const=1,
         metavar="K",
@@ -146,7 +147,7 @@ def _add_selection(parser: argparse.ArgumentParser) -> None:
         "--crop-axes", choices=("xy", "xz", "yz"), help="axes of the polygon's corners (default: xy)"
     )
     parser.add_argument("--sh-degree", type=int, choices=range(4), help="write at most this SH degree")
-    arguments.add_flags(parser, SELECTION, {"--min-opacity": float, "--most": int, "--levels": _levels})
+    arguments.add_flags(parser, SELECTION, {"--min-opacity": _OPACITY, "--most": _COUNT, "--levels": _levels})
 
 
 def run(args: argparse.Namespace) -> None:
@@ -330,16 +331,11 @@ def _selection(args: argparse.Namespace) -> Selection | None:
     """Return what the flags choose; None: everything."""
     if args.crop_axes and not args.crop_polygon:
         raise ValueError("--crop-axes is for --crop-polygon")
-    for flag in ("most", "clean"):
-        if getattr(args, flag) is not None and getattr(args, flag) < 1:
-            raise ValueError(f"--{flag} must be at least 1, got {getattr(args, flag)}")
     if all(getattr(args, name) is None for name in _CHOICES):
         return None
     box = None if args.crop is None else np.array(args.crop).reshape(2, 3)
     if box is not None and not (box[0] < box[1]).all():
         raise ValueError(f"--crop takes the least x y z, then the largest, got {args.crop}")
-    if args.min_opacity is not None and not 0 <= args.min_opacity < 1:
-        raise ValueError(f"--min-opacity must be from 0 to below 1, got {args.min_opacity}")
     return Selection(
         box=box,
         polygon=None if args.crop_polygon is None else read_polygon(args.crop_polygon),

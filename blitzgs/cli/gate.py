@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_path
+from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_path, number
 from blitzgs.config.fields import ScheduleConfig
 from blitzgs.config.files import changed
 from blitzgs.config.schedule import Schedule
@@ -46,7 +46,7 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     add_path(fit, "--out", "FILE", "file for the gate, .json", required=True)
     fit.add_argument(
         "--gate-from",
-        type=float,
+        type=number(float, lambda value: value >= 0, "0 or more"),
         default=ScheduleConfig.gate_from,
         metavar="IMAGES",
         help="also evaluate separately the spawns (births during training) from this time on; take "
@@ -56,7 +56,8 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     add_path(sample, "folder", "RUN", "folder of a run with lineage")
     add_path(sample, "--out", "FILE", "file for the sample, .parquet", required=True)
     text = "approximate number of births in the file (default: %(default)s)"
-    sample.add_argument("--rows", type=int, default=spawn_samples.MAX_ROWS, metavar="N", help=text)
+    count = number(int, lambda value: value >= 1, "at least 1")
+    sample.add_argument("--rows", type=count, default=spawn_samples.MAX_ROWS, metavar="N", help=text)
     judge = add_command(actions, "evaluate", run_evaluate, "measure a gate on the lineage of runs")
     _add_gate(judge)
     add_path(judge, "runs", "RUN", "folder of a run with lineage", nargs="+")
@@ -71,7 +72,8 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     add_path(again, "folder", "RUN", "folder of a run with lineage")
     add_path(again, "--out", "DIR", "folder for these runs and their figures", required=True)
     text = "share of the candidates to withhold (default: %(default)s)"
-    again.add_argument("--rate", type=float, default=0.6, metavar="RATE", help=text)
+    share = number(float, lambda value: 0 <= value <= 1, "in [0, 1]")
+    again.add_argument("--rate", type=share, default=0.6, metavar="RATE", help=text)
     add_capture(again)
     add_device(again, shares_gpus=True)
 
@@ -85,8 +87,6 @@ def run_fit(args: argparse.Namespace) -> None:
     """Fit a gate."""
     if args.out.suffix != ".json":
         raise ValueError(f"--out {args.out}: a gate's file ends in .json")
-    if not args.gate_from >= 0:
-        raise ValueError(f"--gate-from: must be 0 or more, got {args.gate_from}")
     runs = [
         spawn_samples.read_sample(path) if path.suffix == spawn_samples.SUFFIX else _spawns_of(path)
         for path in args.runs
@@ -102,8 +102,6 @@ def run_sample(args: argparse.Namespace) -> None:
     """Write a sample of spawns."""
     if args.out.suffix != spawn_samples.SUFFIX:
         raise ValueError(f"--out {args.out}: a sample's file ends in {spawn_samples.SUFFIX}")
-    if args.rows < 1:
-        raise ValueError(f"--rows: must be at least 1, got {args.rows}")
     run = _spawns_of(args.folder)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     rate = spawn_samples.write_sample(run, args.out, args.rows)
@@ -132,8 +130,6 @@ def run_evaluate(args: argparse.Namespace) -> None:
 
 def run_replay(args: argparse.Namespace) -> None:
     """Train the arms."""
-    if not 0 <= args.rate <= 1:
-        raise ValueError(f"--rate: must be in [0, 1], got {args.rate}")
     gate = SpawnGate(args.gate)
     config = open_run(args.folder).config()
     if args.data is not None:

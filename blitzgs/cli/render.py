@@ -9,7 +9,7 @@ import itertools
 import json
 import re
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,7 +38,7 @@ from blitzgs.view.look import MAX_PIXELS, Look, Mode
 from blitzgs.view.views import CameraLike, ViewSet, viewmat
 from blitzgs.view.visible import Subject, VisibleFinder
 from blitzgs.viewer.film import SUFFIX, Film, check_film, new_film, read_film
-from blitzgs.viewer.studio import Opened, box_of, open_model
+from blitzgs.viewer.studio import box_of, open_model
 
 # What may be written beside the colours.
 MEASURED: tuple[Mode, ...] = ("depth", "alpha")
@@ -84,7 +84,8 @@ def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) 
     """Add the command."""
     parser = arguments.add_command(commands, "render", run, summary, HELP)
     arguments.add_model(parser)
-    arguments.add_flags(parser, "--data DIR  take the cameras from this capture, not from the run")
+    text = "--data DIR  read the cameras anew from this capture, that of the run (of others: --cameras)"
+    arguments.add_flags(parser, text)
     arguments.add_device(parser, shares_gpus=True)
     arguments.add_pool(parser)
     arguments.add_split(parser, "render")
@@ -149,12 +150,13 @@ def _renders(
 
 def _render_film(path: Path, opened: Rendered, film: Film, ranks: Ranks) -> None:
     """Render all frames; rank 0 writes them."""
-    with ExitStack() as stack:
-        append: Callable[[npt.NDArray[np.uint8]], None] | None = None
-        if ranks.rank == 0:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            append = stack.enter_context(new_film(path, film.width, film.height, film.fps))
-        report = stack.enter_context(image_progress("Rendering", ranks.rank == 0))
+    writes = ranks.rank == 0
+    if writes:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        new_film(path, film.width, film.height, film.fps) if writes else nullcontext() as append,
+        image_progress("Rendering", writes) as report,
+    ):
         for position, (_, render) in enumerate(_renders(opened, ranks, lambda _: 0), 1):
             if append is not None and render is not None:
                 append(to_uint8(render))
@@ -246,7 +248,11 @@ class Rendered:
 def open_rendered(args: argparse.Namespace, film: Film | None, ranks: Ranks) -> Rendered:
     """Open the model, and choose the cameras. Collective."""
     if args.model.is_file():
-        opened = _open_ply(args, ranks)
+        if ranks.world_size > 1:
+            raise ValueError(f"{args.model}: one process renders a file: run render without torchrun")
+        if args.data is not None:
+            raise ValueError("--data needs the folder of a run: for a file, use --path or --cameras")
+        opened = open_model(args.model, ranks)
         subject, box = opened.subject, opened.exhibit.box
         stored, exposures = None, None
     else:
@@ -269,14 +275,6 @@ def open_rendered(args: argparse.Namespace, film: Film | None, ranks: Ranks) -> 
         raise ValueError(f"{args.model} has no cameras: use --path, --cameras or the folder of a run")
     inputs = stored.inputs if stored else []
     return Rendered(subject, box, cameras, range(len(cameras)), inputs, {})
-
-
-def _open_ply(args: argparse.Namespace, ranks: Ranks) -> Opened:
-    if ranks.world_size > 1:
-        raise ValueError(f"{args.model}: one process renders a file: run render without torchrun")
-    if args.data is not None:
-        raise ValueError("--data needs the folder of a run: for a file, use --path or --cameras")
-    return open_model(args.model, ranks)
 
 
 def _shared_box(table: GaussianTable, ranks: Ranks) -> npt.NDArray[np.float64]:

@@ -44,8 +44,8 @@ def run(args: argparse.Namespace) -> None:
 _MAX_GAUSSIANS = 4_000_000
 
 
-def write_final_report(folder: Path, summary: Mapping[str, object] | None) -> None:
-    """Write the report of a run that ends; a failure is a warning."""
+def write_final_report(folder: Path, summary: Mapping[str, object] | None) -> bool:
+    """Write the report of a run that ends, and tell whether it is there; a failure is a warning."""
     from blitzgs.report.report import look_of, write_report
 
     count = 0 if summary is None else summary["gaussians"]
@@ -54,6 +54,8 @@ def write_final_report(folder: Path, summary: Mapping[str, object] | None) -> No
         write_report(folder, look)
     except Exception as error:
         warn(f"the report was not written ({type(error).__name__}: {error}); blitzgs report RUN tries again")
+        return False
+    return True
 
 
 COMPARE_HELP = """\

@@ -22,7 +22,15 @@ from blitzgs.cli.arguments import Commands, add_command, add_device, add_flags, 
 from blitzgs.cli.report import write_final_report
 from blitzgs.cli.sfm import understood_alone, with_poses
 from blitzgs.config.fields import Config
-from blitzgs.config.files import ConfigError, changed, default_recipe, load_config, recipe_path, to_dict
+from blitzgs.config.files import (
+    REMOVED,
+    ConfigError,
+    changed,
+    flat,
+    load_config,
+    recipe_path,
+    to_dict,
+)
 from blitzgs.config.ranges import describe, describe_all, describe_page
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import run_files
@@ -42,6 +50,7 @@ from blitzgs.util.progress import Laps
 if TYPE_CHECKING:
     from blitzgs.viewer.live import Live
 
+_PORT = 8080
 # See `blitzgs.training.budget.extended`.
 _EXTENSION = number(
     float,
@@ -82,7 +91,8 @@ FLAGS = """
 --config RECIPE  name of a recipe, or a YAML file (default: aerial on a GPU, aerial_cpu on a CPU)
 --data DIR  folder of the capture, or another program's project
 --out RUN  folder for the results
---start FILE  begin with the Gaussians of a file (PLY, SPZ, SOG, .splat) in the capture's coordinates
+--start FILE  begin with the Gaussians of a file (PLY, SPZ, SOG, .splat) in the capture's coordinates (under
+    torchrun, which refuses this flag: --model.start=FILE)
 --resume  continue from the newest checkpoint in RUN, if any
 --extend IMAGES|FACTOR  train the finished run in RUN longer: by a number of images (100 or more), or to a
     multiple of its length (--extend=1.5)
@@ -100,8 +110,22 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     parser = add_command(commands, "train", run, summary, HELP, add_help=False)
     _add_helps(parser)
     add_flags(parser, FLAGS, {"--extend": _EXTENSION, "--minutes": float})
-    add_live_page(parser)
+    parser.add_argument(
+        "--viewer",
+        type=int,
+        nargs="?",
+        const=_PORT,
+        metavar="PORT",
+        help=f"show the training in the browser (default port: {_PORT}); needs the extra view",
+    )
+    add_flags(parser, "--viewer-host HOST  address to listen on (default: %(default)s, this machine only)")
+    parser.set_defaults(viewer_host="127.0.0.1")
     add_device(parser, shares_gpus=True)
+    for field in (*flat(to_dict(Config())), *REMOVED):
+        parser.add_argument(
+            f"--{field}", dest="overrides", action="append", default=[], type=f"{field}={{}}".format,
+            help=argparse.SUPPRESS,
+        )  # fmt: skip
 
 
 def _add_helps(parser: argparse.ArgumentParser) -> None:
@@ -214,9 +238,9 @@ def run(args: argparse.Namespace) -> None:
                 trainer.watch(live_page(trainer.state, args.viewer, args.viewer_host))
             summary = trainer.train()
             if ranks.rank == 0:
-                write_final_report(args.out, summary)
+                reported = write_final_report(args.out, summary)
                 if summary is not None:
-                    _print_summary(summary, args.out)
+                    _print_summary(summary, args.out, reported)
 
 
 def _check(args: argparse.Namespace, config: Config) -> None:
@@ -246,7 +270,7 @@ def _config(args: argparse.Namespace) -> Config:
     elif args.resume and own is not None and own.exists():
         source = own
     else:
-        recipe = default_recipe(_on_gpu(args))
+        recipe = "aerial" if _on_gpu(args) else "aerial_cpu"
         source = recipe_path(recipe)
         if os.environ.get("RANK", "0") == "0":  # torchrun's number of the process
             print(f"recipe: {recipe} (choose another one with --config)", file=sys.stderr)
@@ -254,8 +278,8 @@ def _config(args: argparse.Namespace) -> Config:
     begun = args.resume and own is not None and any((args.out / run_files.CHECKPOINTS).glob("checkpoint_*"))
     if args.minutes and begun and own is not None and own.exists() and load_config(own).schedule.minutes == 0:
         raise ConfigError(
-            f"--minutes: the run in {args.out} began without it, so its length is decided: leave out "
-            "--minutes to continue it; once it is finished, --extend 1.5 trains half as long again"
+            f"--minutes: the run in {args.out} began without it or was extended, so its length is decided: "
+            "leave out --minutes to continue it; once it is finished, --extend 1.5 trains half as long again"
         )
     config = load_config(source, [*args.overrides, *minutes])
     if args.data is not None:
@@ -283,7 +307,7 @@ _FIGURES: dict[str, tuple[str, int, float]] = {
 }
 
 
-def _print_summary(summary: dict[str, object], folder: Path) -> None:
+def _print_summary(summary: dict[str, object], folder: Path, reported: bool) -> None:
     console, table = Console(emoji=False), Table(show_header=False)
     # Print the path verbatim: rich must not interpret brackets and colons in it.
     console.print(printable(str(folder)), markup=False, highlight=False, soft_wrap=True)
@@ -305,29 +329,12 @@ def _print_summary(summary: dict[str, object], folder: Path) -> None:
     }
     width = max(map(len, commands))
     for text in (
-        f"report: {folder / run_files.REPORT}",
+        *([f"report: {folder / run_files.REPORT}"] if reported else []),
         f"pictures: {folder / run_files.EVALUATION}",
         "next:",
         *(f"  blitzgs {command:{width}}   {what}" for command, what in commands.items()),
     ):
         console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
-
-
-_PORT = 8080
-
-
-def add_live_page(parser: argparse.ArgumentParser) -> None:
-    """Add the flags."""
-    parser.add_argument(
-        "--viewer",
-        type=int,
-        nargs="?",
-        const=_PORT,
-        metavar="PORT",
-        help=f"show the training in the browser (default port: {_PORT}); needs the extra view",
-    )
-    add_flags(parser, "--viewer-host HOST  address to listen on (default: %(default)s, this machine only)")
-    parser.set_defaults(viewer_host="127.0.0.1")
 
 
 def live_page(state: TrainingState, port: int, host: str) -> Live | None:

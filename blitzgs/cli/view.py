@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_flags, add_model
+from blitzgs.config.files import changed, load_config
 from blitzgs.distributed.group import Ranks, extend_memory_in_place, resolve_device
 from blitzgs.formats.streamed_sog import META
 from blitzgs.formats.tiles import PAGE, TILESET
@@ -89,8 +90,6 @@ def run(args: argparse.Namespace) -> None:
 
 def photographs(folder: Path, data: Path | None) -> Callable[[int], npt.NDArray[np.uint8]] | None:
     """Return a function that reads the photographs of a run's cameras; None if the capture is not there."""
-    from blitzgs.config.files import changed, load_config
-
     try:
         config = load_config(folder / run_files.CONFIG)
         if data is not None:

@@ -23,9 +23,8 @@ from blitzgs.config.ranges import flat as flat
 from blitzgs.config.ranges import problems
 from blitzgs.util.output import write_file
 
-
-class Ignored:
-    """Marks a removed field whose values have no effect any more."""
+# Marks a removed field whose values have no effect any more.
+IGNORED = object()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,8 +42,8 @@ class Share:
 # Fields of earlier versions, each with the value that stands for what BlitzGS does now. Files and checkpoints
 # that have this value are still read.
 REMOVED: Mapping[str, Any] = {
-    "data.threads": Ignored(),
-    "data.prefetch": Ignored(),
+    "data.threads": IGNORED,
+    "data.prefetch": IGNORED,
     "model.far": 1e6,
     "model.eps2d": 0.3,
     "model.initial_opacity": 0.1,
@@ -52,7 +51,7 @@ REMOVED: Mapping[str, Any] = {
     "lod.base_resolution": 0.001,
     "lod.fork": FORK,
     "schedule.adaptive": False,
-    "schedule.adaptive_limit": Ignored(),
+    "schedule.adaptive_limit": IGNORED,
     "schedule.placed": [],
     "schedule.levels_until": 0,
     "optimiser.final_share": 1.0,
@@ -64,19 +63,19 @@ REMOVED: Mapping[str, Any] = {
     "optimiser.sh_rest": Share("optimiser.sh_dc", SH_SHARE),
     "loss.size": 0.0,
     "population.absolute_gradients": False,
-    "population.absolute_threshold": Ignored(),
+    "population.absolute_threshold": IGNORED,
     "population.relocate": False,
     "population.opacity_decay": 0.0,
     "population.reset_opacity": 0.01,
-    "view.first_levels": Ignored(),
+    "view.first_levels": IGNORED,
     "view.most_kept": 0.8,
-    "view.level_ratio": Ignored(),
+    "view.level_ratio": IGNORED,
     "view.smooth": False,
     "ranks.half_exchange": False,
-    "ranks.max_imbalance": Ignored(),
-    "ranks.share_gpus": Ignored(),
-    "log.pictures": Ignored(),
-    "log.lpips_weights": Ignored(),
+    "ranks.max_imbalance": IGNORED,
+    "ranks.share_gpus": IGNORED,
+    "log.pictures": IGNORED,
+    "log.lpips_weights": IGNORED,
 }
 
 
@@ -183,7 +182,13 @@ def _read(path: Path, seen: set[Path]) -> dict[str, Any]:
         return values
     if not isinstance(base, str):
         raise ConfigError(f"{path}: base must be a file name or the name of a recipe, got {base!r}")
-    merged = _read(base_file(base, path), seen | {path})
+    # A file beside this one, or a recipe; a copy of a recipe's file names its base with ".yaml".
+    beside, problem = (
+        path.parent / base,
+        f"{path}: base: {base}: no such file in {path.parent} and no such recipe",
+    )
+    found = beside if beside.is_file() else _recipe(base.removesuffix(".yaml"), problem)
+    merged = _read(found, seen | {path})
     _merge(merged, values, str(path))
     return merged
 
@@ -245,7 +250,7 @@ def without_effect(name: str, value: Any, values: Mapping[str, Any]) -> bool:
         whole = values.get(known.field, flat(to_dict(Config()))[known.field])
         return math.isclose(_convert(float, value, name), known.share * _convert(float, whole, known.field))
     found = _convert(float, value, name) if isinstance(known, float) else value
-    return isinstance(known, Ignored) or bool(found == known)
+    return known is IGNORED or bool(found == known)
 
 
 def _hint(name: str, known: list[str]) -> str:
@@ -316,16 +321,6 @@ def recipe_path(given: str) -> Path | None:
     return None if given == DEFAULTS else _recipe(given, f"{given}: no such file or recipe")
 
 
-def base_file(given: str, file: Path) -> Path:
-    """Return the file that `base` names in a configuration file: a path relative to it, or a recipe.
-
-    The name may end in ".yaml": a copy of a recipe's file names its base so.
-    """
-    beside = file.parent / given
-    problem = f"{file}: base: {given}: no such file in {file.parent} and no such recipe"
-    return beside if beside.is_file() else _recipe(given.removesuffix(".yaml"), problem)
-
-
 def _recipe(name: str, problem: str) -> Path:
     """Return the file of a recipe (ConfigError: there is none of this name; `problem` begins the message)."""
     files = (folder / f"{name}.yaml" for folder in _FOLDERS if "/" not in name)
@@ -335,8 +330,3 @@ def _recipe(name: str, problem: str) -> Path:
     close = difflib.get_close_matches(Path(name).stem, known, n=1)
     hint = f"did you mean '{close[0]}'? " if close else ""
     raise ConfigError(f"{problem}; {hint}recipes are {', '.join(known)}")
-
-
-def default_recipe(on_gpu: bool) -> str:
-    """Return the recipe of a run that names none."""
-    return "aerial" if on_gpu else "aerial_cpu"

@@ -77,6 +77,9 @@ def problems(config: Config) -> Iterator[str]:
         yield f"view.lod: must be true, false or smooth, got {config.view.lod}"
     if config.view.cull and not population.importance:
         yield "view.cull: needs population.importance=true, whose passes make the mask"
+    t1, t2 = config.schedule.t1, config.schedule.t2
+    if population.importance and 0 < t2 <= t1 < config.schedule.iterations:
+        yield f"schedule.t2: the second pass must come after the first (schedule.t1), got {t2} and {t1}"
 
 
 def _numbers(value: Any) -> list[Any]:

@@ -4,9 +4,12 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
-from collections.abc import Sequence
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import count, takewhile
+from operator import attrgetter
 from typing import Literal
 
 import torch
@@ -55,8 +58,6 @@ class Pace:
 
 
 EventKind = Literal["densify", "reset_opacities", "pass_1", "pass_2", "clear_cull", "evaluate", "checkpoint"]
-# The events of this number of images are searched at once.
-_SEARCHED = 1024
 # The columns of the learning-rate table.
 RATES = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest")
 
@@ -95,7 +96,6 @@ class Schedule:
         self.batch_size = config.batch_size  # views per step, B
         self.steps = max(1, math.ceil(self._scaled(config.iterations) / self.batch_size))  # of the whole run
         self.iterations = self.steps * self.batch_size  # images of the whole run
-        self._found: tuple[int, int, list[Event]] = (0, 0, [])  # the events of [first, last) images
         self._reductions = [(factor, self._scaled(until)) for factor, until in config.resolution]
 
     def _scaled(self, time: float) -> int:
@@ -104,16 +104,12 @@ class Schedule:
 
     def events(self, begin: int, end: int) -> list[Event]:
         """Return the events with begin <= time < end, in the order in which they happen."""
-        # Training asks after every step, and most steps have no event.
-        first, last, found = self._found
-        if begin < first or end > last:
-            first, last = begin, max(end, begin + _SEARCHED)
-            found = self._search(first, last)
-            self._found = first, last, found
-        return [event for event in found if begin <= event.time < end]
+        first, last = (bisect_left(self._events, time, key=attrgetter("time")) for time in (begin, end))
+        return self._events[first:last]
 
-    def _search(self, begin: int, end: int) -> list[Event]:
-        """See `events`."""
+    @cached_property
+    def _events(self) -> list[Event]:
+        """All events of the run, in the order in which they happen."""
         config = self._config
         # The cull mask is dropped halfway between the last importance pass and the end. A pass that is set
         # to a time after the end does not happen.
@@ -133,19 +129,14 @@ class Schedule:
             Event(time, order, kind)
             for order, (kind, first, until, every) in enumerate(series)
             if every > 0
-            for time in self._series(first, until, every, begin, end)
+            for time in self._series(first, until, every)
         )
 
-    def _series(self, first: float, until: float, every: float, begin: int, end: int) -> list[int]:
-        """Return the images in [begin, end) of the times first + k every < until."""
-        k = max(0, math.floor((self.pace.time(begin) - first) / every) - 1)
-        times: list[int] = []
-        while (unscaled := first + k * every) < until and (time := self._scaled(unscaled)) < end:
-            # A compressed schedule may map two events of one kind to the same image; they become one event.
-            if time >= begin and (not times or times[-1] != time):
-                times.append(time)
-            k += 1
-        return times
+    def _series(self, first: float, until: float, every: float) -> Iterable[int]:
+        """Return the images of the run at the times first + k every < until."""
+        images = map(self._scaled, takewhile(lambda time: time < until, count(first, every)))
+        # A compressed schedule may map two events of one kind to the same image; they become one event.
+        return dict.fromkeys(takewhile(lambda image: image < self.iterations, images))
 
     def sh_degree(self, begin: int, limit: int) -> int:
         """Return the SH degree of the step at [begin, begin + B): one more each `sh_every`, up to `limit`."""
@@ -162,10 +153,7 @@ class Schedule:
 
     def is_last_density_event(self, time: int) -> bool:
         """Tell whether no other density event follows that at `time`."""
-        first, every = self._config.densify_from, self._config.densify_every
-        # `time` is rounded down, so the next event is the first at `time + 1` or later.
-        following = math.ceil((self.pace.time(time + 1) - first) / every)
-        return first + following * every >= self._config.densify_until
+        return all(event.kind != "densify" for event in self.events(time + 1, self.iterations))
 
     def has_new_levels(self, begin: int) -> bool:
         """Tell whether levels follow footprints again before the step at [begin, begin + B)."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -52,11 +53,11 @@ class Format:
 # By the name of the flag of `blitzgs export`.
 FORMATS = {
     "ply": Format(
-        "PLY", ".ply", read_ply, save_ply, (b"ply",), ("antialiasing", "levels"), quantised=False
+        "PLY", ".ply", read_ply, save_ply, (b"ply",), ("antialiasing", "levels", "offset"), quantised=False
     ),
     "compressed-ply": Format(
         "compressed PLY", ".ply", packed.read_compressed_ply, packed.write_compressed_ply, (b"ply",),
-        ("antialiasing",),
+        ("antialiasing", "offset"),
     ),
     "splat": Format(".splat", ".splat", packed.read_splat, packed.write_splat, harmonics=False),
     "spz": Format(
@@ -101,8 +102,9 @@ def open_gaussians(path: Path, checked: bool = True) -> GaussianSource:
 def read_gaussians(path: Path | str) -> Gaussians:
     """Read a model that any program wrote: PLY (INRIA's layout or compressed), SPZ, SOG or .splat.
 
-    SPZ needs the packages of `pip install "blitzgs[formats]"`. ValueError: the file is damaged, no model, or
-    holds values that cannot be shown; names the file. ImportError: a package is missing; says which.
+    Where the format cannot state an offset, that of `offset_file` becomes a header line. SPZ needs the
+    packages of `pip install "blitzgs[formats]"`. ValueError: the file is damaged, no model, or holds values
+    that cannot be shown; names the file. ImportError: a package is missing; says which.
     """
     path = Path(path)
     if path.is_dir():
@@ -115,6 +117,8 @@ def read_gaussians(path: Path | str) -> Gaussians:
     found = kind.read(path)
     with located(str(path)):
         found.check()
+    if "offset" not in kind.states and (offset := stated_offset(offset_file(path))):
+        found.comments = [*found.comments, offset_line(offset)]
     return found
 
 
@@ -124,6 +128,26 @@ def with_degree(model: Gaussians, degree: int) -> Gaussians:
     sh = torch.zeros(len(model), k, 3)
     sh[:, : model.sh.shape[1]] = model.sh[:, :k]
     return replace(model, sh=sh)
+
+
+def offset_file(path: Path) -> Path:
+    """Return the file beside a model that states its offset, if `blitzgs export` wrote one."""
+    return path.with_name(path.name + ".offset.json")
+
+
+def stated_offset(path: Path) -> tuple[float, float, float] | None:
+    """Return the offset in an `offset_file`; None: there is none, or another program wrote the file."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        x, y, z = (float(value) for value in content["offset"])
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return None
+    return (x, y, z) if {"file", "meaning"} <= content.keys() else None
+
+
+def offset_line(offset: tuple[float, float, float]) -> str:
+    """Return the header line that `offset_of` reads."""
+    return "comment offset {!r} {!r} {!r}".format(*offset)
 
 
 def offset_of(comments: list[str]) -> tuple[float, float, float]:

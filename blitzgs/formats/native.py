@@ -23,10 +23,6 @@ Array = npt.NDArray[Any]
 Path = str | bytes
 
 
-class FormatError(ValueError):
-    """A file is damaged; the message has the file, the place and the reason."""
-
-
 def _system_error(message: str) -> OSError:
     """Return the error that Python's own functions raise; the message is that of csrc/io/image_file.h."""
     number, _, path = message.partition(" ")
@@ -36,7 +32,7 @@ def _system_error(message: str) -> OSError:
 # In the order of blitzgs_io_type and blitzgs_io_status_code of csrc/io/io_api.cpp.
 _TYPES = tuple(np.dtype(name) for name in ("u1", "u4", "i8", "u8", "f8"))
 _ERRORS: tuple[Callable[[str], Exception] | None, ...] = (
-    None, FormatError, ValueError, MemoryError, RuntimeError, _system_error,
+    None, ValueError, ValueError, MemoryError, RuntimeError, _system_error,
 )  # fmt: skip
 
 

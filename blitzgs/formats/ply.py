@@ -23,9 +23,12 @@ from torch import Tensor
 
 from blitzgs.formats import native
 from blitzgs.formats.gaussians import BLOCK, SH_C0, Gaussians, GaussianSource, degree_of
+from blitzgs.util.errors import warn
 from blitzgs.util.output import check_replaceable, new_file
 
 LEVEL = "level"
+# Positions may be rounded by this share of the median Gaussian's middle axis.
+MAX_ROUNDING = 0.01
 
 
 def _property_names(coefficients: int) -> list[str]:
@@ -136,6 +139,7 @@ def write_ply(
         sh: [N, K, 3], K = 1, 4, 9 or 16.
         normals: [N, 3]; zero when left out.
         offset: float64 [3] added to the means in float64; `Capture.offset` restores the capture's own world.
+            A warning says if float32 rounds the sums by more than 1 % of the Gaussians' size.
         comments: header lines, each "comment ..." or "obj_info ...".
         levels: [N] octree levels; None: the file has none.
 
@@ -148,6 +152,14 @@ def write_ply(
     """
     found = Gaussians(means, quats, scales, opacities, sh, normals, comments or [], levels)
     found.check()
+    if offset is not None and len(found):
+        farthest = np.abs(means.detach().cpu().double().numpy() + np.asarray(offset)).max()
+        rounding = float(np.spacing(np.float32(farthest))) / 2
+        if rounding > MAX_ROUNDING * float(scales.detach().median(dim=1).values.median().exp()):
+            warn(
+                f"{path}: so far from the origin, float32 rounds positions by up to {rounding:.3g}: instead "
+                'of offset, pass comments=["comment offset X Y Z"], which BlitzGS reads'
+            )
     save_ply(Path(path), found, offset)
 
 

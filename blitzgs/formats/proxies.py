@@ -25,6 +25,8 @@ _BLUR = 0.3
 # variance v^2 / 12 in each; Gaussians hide it without holes if they are sqrt(12 / (2 pi)) times as wide.
 _WIDEST = 1.38
 _MOST_OPAQUE = 0.999
+# Largest variance: float32 holds no square of a length above 1.8e19, which files may have.
+_LARGEST = 1e30
 _UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 
 Rows = npt.NDArray[np.float32]
@@ -34,7 +36,7 @@ Array = npt.NDArray[np.float64]
 def moments(gaussians: Gaussians) -> Rows:
     """Return the moments of Gaussians, [N, 10 + 3 K]."""
     axes = quaternion_matrices(unit_quats(gaussians.quats)) * gaussians.scales.double().exp()[:, None]
-    covariances = (axes @ axes.mT)[:, _UPPER[0], _UPPER[1]]
+    covariances = (axes @ axes.mT)[:, _UPPER[0], _UPPER[1]].clamp(-_LARGEST, _LARGEST)
     cover = gaussians.opacities.double().sigmoid()[:, None]
     columns = [gaussians.means, covariances.float(), cover.float(), gaussians.sh.flatten(1)]
     return torch.cat(columns, dim=1).numpy()
@@ -101,7 +103,7 @@ def _matched(rows: Rows, cells: npt.NDArray[np.int64], cell_of: npt.NDArray[np.i
         ],
         axis=1,
     )
-    result[:, 3:9] = covariances
+    result[:, 3:9] = covariances.clip(-_LARGEST, _LARGEST)
     result[:, 9] = total / _areas(covariances, blur)
     for column in range(10, rows.shape[1]):
         result[:, column] = mean(rows[:, column])

@@ -130,11 +130,13 @@ def read_polygon(path: Path) -> Array:
 
     ValueError: the file has no polygon of finite corners; names it.
     """
-    text = path.read_text(encoding="utf-8", errors="replace")
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
     try:
         if text.lstrip().startswith("{"):
             content = json.loads(text)
             while "coordinates" not in content:
+                if len(content.get("features", [0])) != 1:
+                    raise ValueError(f"it has {len(content['features'])} features: leave one")
                 content = content["features"][0] if "features" in content else content["geometry"]
             if content["type"] != "Polygon" or len(content["coordinates"]) != 1:
                 raise ValueError("it is no polygon without holes")

@@ -52,28 +52,12 @@ def pixel_counts(renders: Tensor, masks: Tensor | None = None) -> Tensor:
     return 3 * (masks != 0).sum((1, 2)).to(renders.dtype)
 
 
-def photometric_sums(
-    renders: Tensor,
-    targets: Tensor,
-    masks: Tensor | None = None,
-    tile_size: int = 16,
-    tile_begin: int = 0,
-    tile_end: int = -1,
-) -> tuple[Tensor, Tensor]:
-    """Sum |x - y| and the SSIM map of each view over the owned, unmasked pixels and the channels.
+def photometric_sums(renders: Tensor, targets: Tensor, masks: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Return the sums of |x - y| and of the SSIM map of each view, [B] each, dtype of `renders`.
 
-    Owned pixels are those of the tiles [tile_begin, tile_end) of all views, tile (b, ty, tx) having index
-    ``(b * tiles_y + ty) * tiles_x + tx``. Sums over a partition of the tiles add up to the whole. The
-    gradient is that of the sums over ALL tiles, returned for the owned pixels and zero elsewhere, so
-    gradients over a partition add up as well; `renders` must be valid within 10 pixels of the owned tiles.
-
-    `tile_size` is the edge of a tile in pixels, and `tile_end` one past the last owned tile, -1 for all.
-    Other arguments and the errors are those of `photometric_loss`. Returns (l1 sums [B], SSIM sums [B]),
-    dtype of `renders`.
+    Sums are over the unmasked pixels and the channels. Arguments and errors are those of `photometric_loss`.
     """
-    return torch.ops.blitzgs.photometric_fwd(
-        renders, targets, _as_bytes(masks), tile_size, tile_begin, tile_end
-    )
+    return torch.ops.blitzgs.photometric_fwd(renders, targets, _as_bytes(masks), 16, 0, -1)
 
 
 def photometric_fwd_bwd(
@@ -93,9 +77,11 @@ def photometric_fwd_bwd(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the sums of `photometric_sums` and the gradient of their weighted total, without autograd.
 
-    Further arguments are those of `photometric_sums`. The sums are returned as K partial sums; `report_` adds
-    them up later, off the critical path of a step. The gradient equals that of `photometric_sums`, but it is
-    defined only at the owned pixels.
+    Only the pixels of the tiles [tile_begin, tile_end) of all views are summed, tile (b, ty, tx) having index
+    ``(b * tiles_y + ty) * tiles_x + tx``. The gradient is that of the sums over ALL tiles, but it is defined
+    only at these owned pixels. Sums and gradients over a partition of the tiles add up to the whole;
+    `renders` must be valid within 10 pixels of the owned tiles. The sums are returned as K partial sums;
+    `report_` adds them up later, off the critical path of a step.
 
     For the loss of `photometric_loss`, summed over views: ``l1_weights = 1 - w``, ``ssim_weights = -w`` and
     ``samples = pixel_counts(renders, masks)``.
@@ -103,6 +89,9 @@ def photometric_fwd_bwd(
     Args:
         l1_weights: [B], weight of each view's L1 sum, dtype of `renders`.
         ssim_weights: [B], weight of each view's SSIM sum.
+        tile_size: edge of a tile in pixels.
+        tile_begin: first owned tile.
+        tile_end: one past the last owned tile; -1: all.
         samples: [B], divisors of the weights, dtype of `renders`; None: 1.
         visible: int64 [B], number of Gaussians visible in each view.
         scale_weight: weight of L_scale, a view's mean smallest axis of its visible Gaussians; only used to

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import os
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -258,9 +258,3 @@ def effective_exposures(measured: Tensor) -> Tensor:
     same[0] = 1
     differs = measured[:, 0].std(0, correction=0).mean() >= LEAST_SPREAD
     return torch.where(differs, measured - mean + same, same)
-
-
-def stored_exposures(shared: Mapping[str, Tensor]) -> Tensor | None:
-    """Return `effective_exposures` of a checkpoint's exposures; None if the run has none."""
-    found = shared.get(SHARED_EXPOSURES)
-    return None if found is None else effective_exposures(found[:, :-1].reshape(-1, 2, 3))

@@ -63,16 +63,12 @@ class Saving:
             columns: name -> [N_rank, ...], this rank's shard; the same names, dtypes and widths on every
                 rank. They must not change before `finish` has returned, and neither must the following two.
             state: the rest of what a resumed run needs, as JSON values; rank 0's is stored.
-            keep: newest checkpoints to keep, at least 1; older ones are deleted after the new one is on disk.
+            keep: newest checkpoints to keep; older ones are deleted after the new one is on disk.
             shared: tensors that are the same on all ranks; rank 0's are stored, in a separate file.
 
         Raises:
             CheckpointError: rank 0 cannot read the folder.
-            ValueError: the columns differ in length, or `keep` < 1.
         """
-        if keep < 1:
-            raise ValueError(f"checkpoint: keep must be at least 1, got {keep}")
-        self._rows = _common_length(columns)
         self._directory, self._state, self._ranks, self._keep = Path(directory), state, ranks, keep
         name, problem = "", None
         if ranks.rank == 0:
@@ -117,7 +113,8 @@ class Saving:
         with torch.cuda.stream(None if ready is None else torch.cuda.Stream(device)):
             if ready is not None:
                 ready.wait()
-            mine = Shard(file, self._rows, *write_shard(self._folder / file, columns))
+            rows = len(next(iter(columns.values())))
+            mine = Shard(file, rows, *write_shard(self._folder / file, columns))
             common = Shard(SHARED, 0, *write_shard(self._folder / SHARED, shared)) if shared else None
         return mine, common
 
@@ -126,7 +123,7 @@ class Saving:
 
         Returns the folder of the new checkpoint, `directory/checkpoint_NNNNNN`; later numbers may have more
         digits. CheckpointError: on every rank, if any rank could not write; earlier checkpoints are
-        unchanged. ValueError: a column has a dtype that the format lacks.
+        unchanged.
         """
         ranks, path = self._ranks, self._directory / self._name
         mine = common = problem = None
@@ -293,10 +290,3 @@ def names_of(directory: Path) -> list[str]:
 
 def _number(name: str) -> int:
     return int(name.rpartition("_")[2])
-
-
-def _common_length(columns: Mapping[str, Tensor]) -> int:
-    lengths = {name: len(column) for name, column in columns.items()}
-    if len(set(lengths.values())) != 1:
-        raise ValueError(f"checkpoint: the columns must be given and of one length, got {lengths}")
-    return next(iter(lengths.values()))

@@ -16,15 +16,21 @@ import torch
 
 from blitzgs.config.files import changed
 from blitzgs.formats.gaussians import Gaussians, GaussianSource
-from blitzgs.formats.models import Format, check_replaces, offset_of
+from blitzgs.formats.models import (
+    Format,
+    check_replaces,
+    offset_file,
+    offset_line,
+    offset_of,
+    stated_offset,
+)
+from blitzgs.formats.ply import MAX_ROUNDING
 from blitzgs.runs.folder import Model
 from blitzgs.runs.source import Changed
 from blitzgs.util.output import write_file
 from blitzgs.view.views import CameraLike, Space
 
 COORDINATES = ("auto", "capture", "centred")
-# Positions may be rounded by this share of the median Gaussian's middle axis.
-_MAX_ROUNDING = 0.01
 
 
 @dataclass(frozen=True)
@@ -59,17 +65,15 @@ def export(
             coordinates are the capture's.
 
     Raises:
-        ValueError: `coordinates` has another value, or there is a value that cannot be shown.
+        ValueError: there is a value that cannot be shown.
         FileExistsError: the file or that of the offset is needed, and another program has one of its name.
         OSError: the file cannot be written, or is no regular file.
     """
-    if coordinates not in COORDINATES:
-        raise ValueError(f"coordinates must be one of {', '.join(COORDINATES)}, got {coordinates!r}")
     check_replaces(path, kind)
     offset = np.array(space.offset)
     farthest, middle = _measured(source, offset)
     rounding = float(np.spacing(np.float32(farthest))) / 2
-    centred = coordinates == "centred" or (coordinates == "auto" and rounding > _MAX_ROUNDING * middle)
+    centred = coordinates == "centred" or (coordinates == "auto" and rounding > MAX_ROUNDING * middle)
     if coordinates == "auto" and kind.quantised:
         centred |= float(np.linalg.norm(offset)) > 2 * space.extent * space.unit
     if centred:
@@ -124,14 +128,14 @@ def _write(
 
     The header states it, too.
     """
-    sidecar = path.with_name(path.name + ".offset.json")
+    sidecar = offset_file(path)
     lines = [line for line in source.comments if offset_of([line]) == (0, 0, 0)]
     if offset is not None:
-        if os.path.lexists(sidecar) and not _has_offset(sidecar):
+        if os.path.lexists(sidecar) and stated_offset(sidecar) is None:
             raise FileExistsError(
                 f"{sidecar} exists and is not the offset of an exported model: choose another name"
             )
-        lines.append("comment offset {!r} {!r} {!r}".format(*offset))
+        lines.append(offset_line(offset))
     step = torch.from_numpy(shift)
 
     def moved(block: Gaussians) -> Gaussians:
@@ -140,7 +144,7 @@ def _write(
     write(path, Changed(source, moved, lines))
     if offset is None:
         # The offset of an earlier export to this name would move the model once more.
-        if _has_offset(sidecar):
+        if stated_offset(sidecar) is not None:
             sidecar.unlink()
         return None
     meaning = f"{'capture' if crs is None else 'world'} coordinates = coordinates in the file + offset"
@@ -156,15 +160,6 @@ def _measured(source: GaussianSource, offset: npt.NDArray[np.float64]) -> tuple[
         farthest = max(farthest, float(np.abs(block.means.double().numpy() + offset).max()))
         middles.append(block.scales.median(dim=1).values)
     return farthest, torch.cat(middles).median().exp().item() if middles else math.inf
-
-
-def _has_offset(sidecar: Path) -> bool:
-    """Tell whether a file is the offset of an exported model."""
-    try:
-        content = json.loads(sidecar.read_text())
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(content, dict) and {"file", "offset", "meaning"} <= content.keys()
 
 
 @torch.no_grad()

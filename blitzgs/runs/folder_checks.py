@@ -69,8 +69,10 @@ def _lock(path: Path, stack: contextlib.ExitStack) -> str | None:
                 "run out of it"
             )
             return None
-    os.ftruncate(descriptor, 0)
-    os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+    # The name is only for the message above: a full disk is left to `check_writable` to name.
+    with contextlib.suppress(OSError):
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
     return None
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The log of a run: a progress bar (or plain lines), a JSONL file and TensorBoard events.
 
-A failure to log never ends a run. If the disk is full or the terminal is closed, one warning is printed, and
-records are kept in memory to be written later.
+A failure to write never ends a run. If the disk is full, one warning is printed, and records are kept in
+memory to be written later. What is printed survives a closed terminal by `blitzgs.cli.output`.
 """
 
 from __future__ import annotations
@@ -68,9 +68,12 @@ class RunLog:
         Records are appended to `folder/log.jsonl` and, if the package is installed, to `folder/tensorboard`.
         Without a folder nothing is logged.
         """
-        self._failures = _Failures()
-        self._file: _JsonLines | None = None
-        self._board: _Board | None = None
+        self._failed: set[str] = set()  # kinds of logs of which a failure was told
+        self._file = None if folder is None else folder / LOG
+        self._waiting: deque[bytes] = deque(maxlen=_MAX_WAITING)  # lines that are not in the file yet
+        self._board: Path | None = None  # folder of TensorBoard's events
+        self._writer: Any = None  # of these events
+        self._done = done
         self._progress: Progress | None = None
         self._task = TaskID(0)
         self._moved = 0.0
@@ -82,12 +85,11 @@ class RunLog:
         self.console = Console(quiet=folder is None, highlight=False)
         if folder is None:
             return
-        with self._failures.tolerated("log file"):
+        with self._tolerated("log file"):
             folder.mkdir(parents=True, exist_ok=True)
             _drop_repeated(folder / LOG, run_id, done, total)
-        self._file = _JsonLines(folder / LOG, self._failures)
         if tensorboard and find_spec("tensorboard") is not None:
-            self._board = _Board(folder / BOARD, done, self._failures)
+            self._board = folder / BOARD
         if self.console.is_terminal:
             bar = [BarColumn(bar_width=8)] if self.console.width >= 60 else []
             self._progress = Progress(
@@ -129,8 +131,7 @@ class RunLog:
     def scalars(self, t: int, values: Mapping[str, float]) -> None:
         """Record numbers at time `t` (images)."""
         self._write(t, values)
-        if self._board is not None:
-            self._board.add(t, values)
+        self._draw(t, values)
         text = self._shown(values)
         if self._progress is not None:
             self._progress.update(self._task, completed=t, total=self.total, description=text)
@@ -158,99 +159,70 @@ class RunLog:
         is_held_out = kind == "glance" or (kind == "evaluation" and values.get("split") == "test")
         if is_held_out and "psnr" in values:
             self._held_out = values["psnr"]
-        if self._board is not None:
-            numbers = {name: value for name, value in values.items() if isinstance(value, (int, float))}
-            self._board.add(t, {f"{kind}/{name}": value for name, value in numbers.items()})
+        numbers = {name: value for name, value in values.items() if isinstance(value, (int, float))}
+        self._draw(t, {f"{kind}/{name}": value for name, value in numbers.items()})
         if text is not None:
             self._print(f"{t:>7,} {text}")
 
     def close(self) -> None:
         """Write remaining records and end the progress display."""
         if self._progress is not None:
-            with self._failures.tolerated("terminal"):
-                self._progress.stop()
-        if self._board is not None:
-            self._board.close()
-        if self._file is not None:
-            self._file.flush()
-            self._file = None
+            self._progress.stop()
+        if self._writer is not None:
+            with self._tolerated("TensorBoard"):
+                self._writer.close()
+        self._flush()
+        self._file = None
 
     def _write(self, t: int, values: Mapping[str, Any]) -> None:
         if self.listener is not None:
             self.listener(t, values)
         if self._file is not None:
-            self._file.add({"t": t} | ({"run": self._run_id} if self._run_id else {}) | dict(values))
+            record = {"t": t} | ({"run": self._run_id} if self._run_id else {}) | dict(values)
+            self._waiting.append(json.dumps(record).encode() + b"\n")
+            self._flush()
 
-    def _print(self, text: str) -> None:
-        with self._failures.tolerated("terminal"):
-            self.console.print(printable(text), soft_wrap=True, markup=False, emoji=False)
+    def _flush(self) -> None:
+        """Write the lines that wait; those that cannot be written go on waiting."""
+        if self._file is None or not self._waiting:
+            return
+        # Open the file each time, because its disk may have been detached and attached again.
+        with self._tolerated("log file"), open(self._file, "ab", buffering=0) as file:
+            while self._waiting:
+                line = self._waiting[0]
+                written = file.write(line)
+                if written < len(line):
+                    # Write the rest when there is space again; readers skip lines that stay incomplete.
+                    self._waiting[0] = line[written:]
+                    raise OSError("the disk is full")
+                self._waiting.popleft()
 
-
-class _JsonLines:
-    """A file with one JSON record per line; records that cannot be written are kept in memory."""
-
-    def __init__(self, path: Path, failures: _Failures) -> None:
-        self._path, self._failures = path, failures
-        self._waiting: deque[bytes] = deque(maxlen=_MAX_WAITING)
-
-    def add(self, record: Mapping[str, Any]) -> None:
-        self._waiting.append(json.dumps(record).encode() + b"\n")
-        self.flush()
-
-    def flush(self) -> None:
-        with self._failures.tolerated("log file"):
-            if not self._waiting:
-                return
-            # Open the file each time, because its disk may have been detached and attached again.
-            with open(self._path, "ab", buffering=0) as file:
-                while self._waiting:
-                    line = self._waiting[0]
-                    written = file.write(line)
-                    if written < len(line):
-                        # Write the rest when there is space again; readers skip lines that stay incomplete.
-                        self._waiting[0] = line[written:]
-                        raise OSError("the disk is full")
-                    self._waiting.popleft()
-
-
-class _Board:
-    """TensorBoard's events."""
-
-    def __init__(self, folder: Path, done: int, failures: _Failures) -> None:
-        self._folder, self._done, self._failures = folder, done, failures
-        self._writer: Any = None
-
-    def add(self, t: int, values: Mapping[str, float]) -> None:
-        with self._failures.tolerated("TensorBoard"):
+    def _draw(self, t: int, values: Mapping[str, float]) -> None:
+        """Add numbers to TensorBoard's events."""
+        if self._board is None:
+            return
+        with self._tolerated("TensorBoard"):
             from torch.utils.tensorboard import SummaryWriter
 
             # Drop the steps after `done` that an interrupted run has logged: they will be logged again.
             purge = self._done + 1 if self._done else None
-            writer = self._writer or SummaryWriter(str(self._folder), purge_step=purge)
+            writer = self._writer or SummaryWriter(str(self._board), purge_step=purge)
             self._writer = None  # after an error its thread has ended, and the next record makes a new one
             for name, value in values.items():
                 writer.add_scalar(name, value, t)
             self._writer = writer
 
-    def close(self) -> None:
-        with self._failures.tolerated("TensorBoard"):
-            if self._writer is not None:
-                self._writer.close()
-
-
-class _Failures:
-    """Turns the errors of a log into warnings, one for each kind of log."""
-
-    def __init__(self) -> None:
-        self._warned: set[str] = set()
+    def _print(self, text: str) -> None:
+        self.console.print(printable(text), soft_wrap=True, markup=False, emoji=False)
 
     @contextlib.contextmanager
-    def tolerated(self, kind: str) -> Iterator[None]:
+    def _tolerated(self, kind: str) -> Iterator[None]:
+        """Make a warning of the first error of a kind of log, and nothing of later ones."""
         try:
             yield
         except (OSError, ValueError, RuntimeError, ImportError) as error:
-            if kind not in self._warned:
-                self._warned.add(kind)
+            if kind not in self._failed:
+                self._failed.add(kind)
                 with contextlib.suppress(OSError):
                     warn(f"{kind}: {error}; training goes on, records may be missing there")
 

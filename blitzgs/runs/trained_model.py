@@ -19,7 +19,7 @@ from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs import checkpoint
-from blitzgs.runs.cameras import stored_exposures
+from blitzgs.runs.cameras import SHARED_EXPOSURES, effective_exposures
 from blitzgs.runs.checkpoint import CheckpointError
 from blitzgs.runs.checkpoint_files import DAMAGE
 from blitzgs.runs.guard import bad_column, check_before_saving
@@ -89,10 +89,15 @@ class Progress:
         fork, smooth = level_fork(config), config.view.lod == "smooth"
         return LodGate(self.reference_distance, fork, self.level_count, self.finest_level, smooth)
 
+    @property
+    def least_gated(self) -> float:
+        """The smallest share of the Gaussians that a view with the LOD gate keeps; see `ModelGate`."""
+        return _SLACK * self.least_kept
+
     def model_gate(self, config: Config, table: GaussianTable, ranks: Ranks) -> ModelGate | None:
         """Return the LOD gate for any camera; None: it is not open. No step may be pending. Collective."""
         gate = self.lod_gate(config)
-        return None if gate is None else ModelGate(gate, MOST_KEPT, table, ranks, _SLACK * self.least_kept)
+        return None if gate is None else ModelGate(gate, MOST_KEPT, table, ranks, self.least_gated)
 
 
 @dataclass
@@ -113,7 +118,8 @@ class TrainedModel:
     @property
     def exposures(self) -> torch.Tensor | None:
         """Gain and bias of each training photograph, [T, 2, 3]; None if the run has none."""
-        return stored_exposures(self.shared)
+        found = self.shared.get(SHARED_EXPOSURES)
+        return None if found is None else effective_exposures(found[:, :-1].reshape(-1, 2, 3))
 
     def subject(self, ranks: Ranks) -> Subject:
         """Return what views are rendered from, on the ranks' device. Collective.
@@ -152,7 +158,8 @@ def save(folder: Path, model: TrainedModel, ranks: Ranks, in_background: bool = 
     columns = {name: table[name] for name in table}
     # Ranks that share a memory all copy their parts into it.
     sharing = ranks.world_size if table.device.type == "cpu" or ranks.shares_gpu else 1
-    has_room = in_background and 2 * sharing * table.memory_bytes < _memory_left(table.device)
+    left = torch.cuda.mem_get_info(table.device)[0] if table.device.type == "cuda" else available_bytes()
+    has_room = in_background and 2 * sharing * table.memory_bytes < left
     if has_room:
         columns = {name: column.clone() for name, column in columns.items()}
     saving = checkpoint.Saving(folder / CHECKPOINTS, columns, state, ranks, keep, model.shared)
@@ -160,10 +167,6 @@ def save(folder: Path, model: TrainedModel, ranks: Ranks, in_background: bool = 
         with ranks.watchdog.working("writing a checkpoint"):
             saving.wait()
     return saving
-
-
-def _memory_left(device: torch.device) -> int:
-    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else available_bytes()
 
 
 def restore(
@@ -248,7 +251,11 @@ def open_model(
     holds no checkpoint.
     """
     check_is_run(folder)
-    pool_bytes = int((_resident_gb(folder / CONFIG) if resident_gb is None else resident_gb) * 1e9)
+    if resident_gb is None:
+        resident_gb = 0.0
+        with suppress(ConfigError):
+            resident_gb = load_config(folder / CONFIG).memory.resident_gb
+    pool_bytes = int(resident_gb * 1e9)
     home = torch.device("cpu") if pool_bytes > 0 else ranks.device
     model = restore(folder, ranks, home, only)
     if model is None:
@@ -261,11 +268,3 @@ def open_model(
     optimiser = TableAdam(config.optimiser, Schedule(config.schedule), model.space.extent, home)
     optimiser.catch_up(model.table, None, model.progress.step)
     return model
-
-
-def _resident_gb(path: Path) -> float:
-    """Return how many gigabytes of a device the configuration gives to the Gaussians; 0: no limit."""
-    try:
-        return load_config(path).memory.resident_gb
-    except ConfigError:
-        return 0.0

@@ -22,6 +22,7 @@ from blitzgs.formats.gaussians import Gaussians
 from blitzgs.formats.models import offset_of
 from blitzgs.ops.harmonics import spherical_harmonics
 from blitzgs.runs.folder import Model
+from blitzgs.runs.trained_model import MOST_KEPT
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import GaussianTable
 from blitzgs.util.output import write_file
@@ -133,24 +134,29 @@ def check_seen(found: Gaussians, path: Path, capture: Capture) -> None:
         )
 
 
-def gate_of(found: Gaussians, unit: float) -> LodGate | None:
-    """Return the LOD gate in a header of `blitzgs export`; `unit` is a trained unit in the file's."""
-    pattern = r"comment lod reference_distance (\S+) fork (\S+) levels (\d+) finest (\d+)( smooth)?"
+def gate_of(found: Gaussians, unit: float) -> tuple[LodGate | None, float]:
+    """Return the LOD gate in a header of `blitzgs export`, and the share that a view with it keeps at least.
+
+    `unit` is a trained unit in the file's. Headers of old files do not state the share, which is then 0.
+    """
+    pattern = (
+        r"comment lod reference_distance (\S+) fork (\S+) levels (\d+) finest (\d+)"
+        r"( smooth)?(?: least (\S+))?"
+    )
     matches = [match for line in found.comments if (match := re.fullmatch(pattern, line.strip()))]
     if not matches or found.levels is None:
-        return None
-    distance, fork, count, finest, smooth = matches[0].groups()
-    return LodGate(float(distance) / unit, float(fork), int(count), int(finest), smooth is not None)
+        return None, 0.0
+    distance, fork, count, finest, smooth, least = matches[0].groups()
+    gate = LodGate(float(distance) / unit, float(fork), int(count), int(finest), smooth is not None)
+    return gate, float(least or 0)
 
 
-def subject_of_file(
-    found: Gaussians, config: Config, space: Space, ranks: Ranks, most_kept: float = math.inf
-) -> Subject:
+def subject_of_file(found: Gaussians, config: Config, space: Space, ranks: Ranks) -> Subject:
     """Return what views of the Gaussians of a file are rendered from. Collective if the file has an LOD gate.
 
-    `most_kept`: see `ModelGate`.
+    The same views have the gate as those of the run that the file was exported from.
     """
-    table, gate = trained_table(found, space, ranks), gate_of(found, space.unit)
+    table, (gate, least) = trained_table(found, space, ranks), gate_of(found, space.unit)
     options = render_options(config, space, found.degree, gate)
-    lod = None if gate is None else ModelGate(gate, most_kept, table, ranks)
+    lod = None if gate is None else ModelGate(gate, MOST_KEPT, table, ranks, least)
     return Subject(table, options, space, lod)

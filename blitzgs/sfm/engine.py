@@ -11,7 +11,7 @@ import sqlite3
 import subprocess
 import sys
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -21,6 +21,7 @@ import numpy as np
 
 from blitzgs.capture.colmap import Float64, read_model
 from blitzgs.util.errors import warn
+from blitzgs.util.progress import Report
 
 _PAIR_IDS = 2147483647  # the id of a pair of images a < b is this number times a, plus b
 
@@ -70,7 +71,6 @@ def camera_of(database: Path, names: Sequence[str]) -> int | None:
     return next((known[name] for name in names if name in known), None)
 
 
-Report = Callable[[int, int], None]
 STAGES = {"features": "features", "pairs": "matches", "cameras": "poses"}
 # What COLMAP prints as it goes on: photographs or blocks of pairs and their total, or poses found.
 _STEP = re.compile(r"\[(\d+)/(\d+)(?:, (\d+)/(\d+))?\]")

@@ -9,7 +9,6 @@ import time
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -46,13 +45,16 @@ _DECODED_AHEAD = 4
 MAX_MASKED = 0.95
 
 
-class _Plan(NamedTuple):
+@dataclass
+class _Plan:
     """What is known about a batch before its photographs are decoded; see `Batch`."""
 
     indices: list[int]
     ranges: TileRanges | None
     rows: list[tuple[int, int]]  # the pixel rows [y0, y1) of each view that this rank needs
     reduction: int  # by which factor the photographs are reduced
+    is_prefetched: bool = False  # whether its photographs are being decoded
+    loading: Future[tuple[Batch, _Slot]] | None = None
 
 
 # The part of a view's photograph that a batch needs: pixel rows, the mask, and `Batch.samples`.
@@ -62,9 +64,7 @@ _Photograph = tuple[np.ndarray | None, Tensor | None, float]
 class _Slot:
     """Memory in which batches are assembled and from which they are uploaded, one after the other.
 
-    On the CPU, host memory and device memory are the same. All parts of a batch are in one allocation, so
-    that few calls upload it: during each call, this thread and the thread that launches kernels may block
-    each other.
+    On the CPU, host memory and device memory are the same.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -79,42 +79,33 @@ class _Slot:
         if shape == self._shape:
             return
         count, height, width, masked = shape
-        area, on_gpu = count * height * width, self._device.type == "cuda"
-        # Each part begins at a multiple of 256 bytes, as a separate tensor would.
-        self._begin = _aligned(4 * count * (VIEW_NUMBERS + 1))
-        self._end = _aligned(self._begin + 3 * area)
-        size = self._end + masked * area
-        self._host = torch.empty(size, dtype=torch.uint8, pin_memory=on_gpu)
-        self._on_device = torch.empty(size, dtype=torch.uint8, device=self._device) if on_gpu else self._host
+        on_gpu = self._device.type == "cuda"
+        # Views as `ViewSet.write` writes them, then each view's samples; photographs; 0 = excluded pixel.
+        numbers = torch.empty(count * (VIEW_NUMBERS + 1), dtype=torch.float32, pin_memory=on_gpu)
+        pixels = torch.empty((count, height, width, 3), dtype=torch.uint8, pin_memory=on_gpu)
+        included = torch.empty((masked * count, height, width), dtype=torch.uint8, pin_memory=on_gpu)
+        self._host = numbers, pixels, included
+        self._on_device = [
+            torch.empty_like(part, device=self._device) if on_gpu else part for part in self._host
+        ]
         self._shape = shape
-        # On the host: views as `ViewSet.write` writes them, then each view's samples; uint8 [B, H, W, 3]; and
-        # uint8 [B, H, W], 0 = excluded pixel.
-        numbers, pixels, included = self._parts(self._host)
-        self.numbers, self.pixels = numbers.numpy(), pixels.numpy()
-        self.included = None if included is None else included.numpy()
-        numbers, self._targets, self._masks = self._parts(self._on_device)
+        self.numbers, self.pixels, self.included = (part.numpy() for part in self._host)
+        numbers, self._targets, included = self._on_device
+        self._masks = included if masked else None
         self._views = unpack_views(numbers[:-count], width, height)
         self._samples = numbers[-count:]
 
-    def _parts(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        count, height, width, masked = self._shape
-        numbers = memory[: 4 * count * (VIEW_NUMBERS + 1)].view(torch.float32)
-        pixels = memory[self._begin :][: 3 * count * height * width].view(count, height, width, 3)
-        return numbers, pixels, memory[self._end :].view(count, height, width) if masked else None
-
     def upload(self, rows: list[tuple[int, int]]) -> None:
         """Upload from the first to the last needed pixel row; `rows` has those of each view, [y0, y1)."""
-        if self._on_device is self._host:
+        if self._device.type != "cuda":
             return
-        count, height, width, _ = self._shape
+        height = self._shape[1]
         needed = [view * height + y for view, (y0, y1) in enumerate(rows) if y0 < y1 for y in (y0, y1)]
-        first, last = (needed[0], needed[-1]) if needed else (0, 0)
-        begin, end = (self._begin + 3 * width * y for y in (first, last))
-        parts = [(0, end)] if first == 0 else [(0, self._begin), (begin, end)]
-        if self._masks is not None:
-            parts.append((self._end, len(self._host)))
-        for begin, end in parts:
-            self._on_device[begin:end].copy_(self._host[begin:end], non_blocking=True)
+        some = slice(needed[0], needed[-1]) if needed else slice(0)
+        for place, (host, on_device) in enumerate(zip(self._host, self._on_device, strict=True)):
+            if place == 1:  # of the photographs
+                host, on_device = host.flatten(0, 1)[some], on_device.flatten(0, 1)[some]
+            on_device.copy_(host, non_blocking=True)
 
     def batch(self, indices: list[int], ranges: TileRanges | None) -> Batch:
         """Return the batch that was assembled in this memory."""
@@ -156,9 +147,7 @@ class BatchLoader:
         self._device = device
         self._ahead = ahead
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
-        self._plans: dict[int, _Plan] = {}
-        self._prefetched: set[int] = set()  # the steps whose photographs are being decoded
-        self._pending: dict[int, Future[tuple[Batch, _Slot]]] = {}
+        self._plans: dict[int, _Plan] = {}  # by step
         # One slot is in use; the others hold batches that are ready or being prepared.
         self._free = deque(_Slot(device) for _ in range(ahead + 2))
         self._current: _Slot | None = None
@@ -177,20 +166,19 @@ class BatchLoader:
         if step in self._plans and self._plans[step].reduction != self._sampler.reduction(step):
             self._drop(step)  # the pace of the run has changed since
         for later in range(step, max(step + 1, min(step + (1 + _DECODED_AHEAD) * self._ahead + 1, last))):
-            is_near = later <= step + self._ahead
-            if later not in self._plans:
-                self._plans[later] = self._plan(later)
-                if not is_near and self._has_room(later - step, self._plans[later]):
-                    self._prefetch(later)
-            if is_near and later not in self._pending:
-                if later not in self._prefetched:  # there was no room for its photographs before
-                    self._prefetch(later)
-                self._pending[later] = self._worker.submit(self._load, self._plans[later])
-        begin = time.perf_counter()
-        batch, slot = self._pending.pop(step).result()
+            plan, is_near = self._plans.get(later), later <= step + self._ahead
+            if plan is None:
+                plan = self._plans[later] = self._plan(later)
+                if not is_near and self._has_room(later - step, plan):
+                    self._prefetch(plan)
+            if is_near and plan.loading is None:
+                if not plan.is_prefetched:  # there was no room for its photographs before
+                    self._prefetch(plan)
+                plan.loading = self._worker.submit(self._load, plan)
+        begin, loading = time.perf_counter(), self._plans.pop(step).loading
+        assert loading is not None
+        batch, slot = loading.result()
         self.waited += time.perf_counter() - begin
-        del self._plans[step]
-        self._prefetched.discard(step)
         if stream is not None:
             stream.wait_event(slot.uploaded)
         self._current = slot
@@ -222,15 +210,12 @@ class BatchLoader:
         return _Plan(indices, ranges, ranges.pixel_rows(self._owners.ranks.rank), reduction)
 
     def _drop(self, step: int) -> None:
-        del self._plans[step]
-        self._prefetched.discard(step)
-        if step in self._pending:
+        if (loading := self._plans.pop(step).loading) is not None:
             with contextlib.suppress(OSError, ValueError):
-                self._give_back(self._pending.pop(step).result()[1])
+                self._give_back(loading.result()[1])
 
-    def _prefetch(self, step: int) -> None:
-        plan = self._plans[step]
-        self._prefetched.add(step)
+    def _prefetch(self, plan: _Plan) -> None:
+        plan.is_prefetched = True
         needed = [index for index, (y0, y1) in zip(plan.indices, plan.rows, strict=True) if y0 < y1]
         self._images.prefetch(needed, plan.indices, plan.reduction)
 
@@ -274,8 +259,8 @@ class BatchLoader:
         return strip, mask, self._sample_counts[index, reduction]
 
     def _fill(self, slot: _Slot, plan: _Plan, photographs: list[_Photograph]) -> Batch:
-        indices, ranges, rows, reduction = plan
-        count, (width, height) = len(indices), self._views.size(indices, reduction)
+        indices, rows = plan.indices, plan.rows
+        count, (width, height) = len(indices), self._views.size(indices, plan.reduction)
         strips, masks, samples = zip(*photographs, strict=True)
         if self._stream is not None:
             slot.uploaded.synchronize()  # returns at once: this upload ended long ago
@@ -284,16 +269,11 @@ class BatchLoader:
         for view, (strip, (y0, y1)) in enumerate(zip(strips, rows, strict=True)):
             if strip is not None:
                 slot.pixels[view, y0:y1] = strip
-        if slot.included is not None:
-            for place, mask in zip(slot.included, masks, strict=True):
-                place[...] = 1 if mask is None else mask.numpy()
-        self._views.write(indices, slot.numbers[:-count], reduction)
+        for place, mask in zip(slot.included, masks, strict=False):  # no place where no view has a mask
+            place[...] = 1 if mask is None else mask.numpy()
+        self._views.write(indices, slot.numbers[:-count], plan.reduction)
         slot.numbers[-count:] = samples
         slot.upload(rows)
         if self._stream is not None:
             slot.uploaded.record(self._stream)
-        return slot.batch(indices, ranges)
-
-
-def _aligned(size: int) -> int:
-    return -(-size // 256) * 256
+        return slot.batch(indices, plan.ranges)

@@ -62,11 +62,8 @@ class Exposures:
         return effective_exposures(self.measured)
 
     def of(self, indices: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Return gains and biases, float32 [B, 1, 1, 3] each; of views without any, 1 and 0."""
-        chosen = self.effective()[[self._rows.get(index, 0) for index in indices]].float()
-        for place, index in enumerate(indices):
-            if index not in self._rows:
-                chosen[place, 0], chosen[place, 1] = 1, 0
+        """Return gains and biases of training views, float32 [B, 1, 1, 3] each."""
+        chosen = self.effective()[[self._rows[index] for index in indices]].float()
         return chosen[:, 0, None, None], chosen[:, 1, None, None]
 
     def measure(self, step: int, renders: Tensor, batch: Batch) -> None:

@@ -36,15 +36,9 @@ def read_ahead(data: DataConfig) -> Future[Capture] | None:
     if data.allow_missing or not data.path:
         return None
     pool = ThreadPoolExecutor(1, "blitzgs-capture")
-    reading = pool.submit(_read, data)
+    reading = pool.submit(load_configured, data)
     pool.shutdown(wait=False)
     return reading
-
-
-def _read(data: DataConfig) -> Capture:
-    """Load a capture, after the digest of the code that `check_alike` compares."""
-    code_fingerprint()
-    return load_configured(data)
 
 
 def open_capture(

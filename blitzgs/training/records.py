@@ -10,7 +10,7 @@ import resource
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import Any
 
 import psutil
 import torch
@@ -109,19 +109,14 @@ def _logged(path: Path, run_id: str) -> list[tuple[int, int]]:
     return points
 
 
-class StepRecord(NamedTuple):
-    """The figures of a step, which the host reads later, so that it does not wait for the device."""
+def measure_step(state: TrainingState, frame: Frame, batch: Batch) -> HostCopy:
+    """Queue the measurement of a step between its forward and its backward pass. Collective.
 
-    # float64 as int64 [7 + B]. Of all ranks: the number of ranks with parameters that are not finite, the
-    # Gaussians that the step projected, those of them that are visible in a view, and all Gaussians. Of the
-    # batch: L_scale and L_opacity (0 if their weights are), PSNR (nan if all pixels are masked), and
-    # `Batch.samples` [B].
-    figures: HostCopy
-    sums: HostSum  # `LossTerms.parts` over all ranks
-
-
-def measure_step(state: TrainingState, frame: Frame, batch: Batch, sums: HostSum) -> StepRecord:
-    """Queue the measurement of a step between its forward and its backward pass. Collective."""
+    Returns float64 as int64 [7 + B]. Of all ranks: the number of ranks with parameters that are not finite,
+    the Gaussians that the step projected, those of them that are visible in a view, and all Gaussians. Of the
+    batch: L_scale and L_opacity (0 if their weights are), PSNR (nan if all pixels are masked), and
+    `Batch.samples` [B].
+    """
     loss, extent, table = state.config.loss, state.space.extent, state.stepper.table
     assert frame.active is not None  # as in every step of a training
     active = frame.active.considered()
@@ -136,18 +131,21 @@ def measure_step(state: TrainingState, frame: Frame, batch: Batch, sums: HostSum
         opacity = opacity_term(frame, table).mean()
     terms = torch.stack([scale, opacity, batch_psnr(frame, batch)])
     figures = torch.cat([counts.double(), terms.double(), batch.samples.double()])
-    return StepRecord(HostCopy(figures.view(torch.int64)), sums)
+    return HostCopy(figures.view(torch.int64))
 
 
-def log_step(state: TrainingState, record: StepRecord) -> None:
-    """Write the record of the last step; wait for its figures, and check the parameters (NonFiniteError)."""
+def log_step(state: TrainingState, measured: HostCopy, sums: HostSum) -> None:
+    """Write the record of the last step; wait for its figures, and check the parameters (NonFiniteError).
+
+    `measured`: of `measure_step`. `sums`: `LossTerms.parts` over all ranks.
+    """
     with state.ranks.watchdog.waiting("read_figures"):
-        figures = record.figures.read().view(torch.float64)
+        figures = measured.read().view(torch.float64)
     bad, active, visible, population, scale, opacity, psnr = figures[:7].tolist()
     if bad:
         check_table(state.stepper.table, state.progress.step)
     samples, loss = figures[7:].float(), state.config.loss
-    losses = photometric(record.sums.read()[: 2 * len(samples)], samples, loss)
+    losses = photometric(sums.read()[: 2 * len(samples)], samples, loss)
     values = {
         "loss": losses.mean().item() + loss.scale * scale + loss.opacity * opacity,
         # Without a pixel that counts there is no PSNR, and JSON has no nan.
@@ -177,8 +175,7 @@ def peak_memory_bytes(device: torch.device) -> int:
 def memory_bytes(device: torch.device) -> int:
     """Return this process's memory in bytes now: allocated on a GPU, or resident on the CPU."""
     if device.type == "cuda":
-        # torch.cuda.memory_allocated reads the same, but copies all figures of the allocator first.
-        return int(torch.cuda.memory_stats_as_nested_dict(device)["allocated_bytes"]["all"]["current"])
+        return torch.cuda.memory_allocated(device)
     return int(psutil.Process().memory_info().rss)
 
 

@@ -45,12 +45,10 @@ class BatchSampler:
         """Group the views by their image sizes, which are any hashable values.
 
         A tour has all views, so ordered that neighbours see the same places; None: no place matters.
-        ValueError: there is no view, or the tour does not have each view once.
+        ValueError: there is no view.
         """
         if not sizes:
             raise ValueError("there are no training views: check the capture and its split")
-        if tour is not None and sorted(tour) != list(range(len(sizes))):
-            raise ValueError(f"the tour must have each of the {len(sizes)} views once, got {len(tour)} views")
         # Of each view, the share of the tour before it.
         self._places = None if tour is None else torch.tensor(tour).argsort() / len(sizes)
         groups: dict[Hashable, list[int]] = {}

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,7 +28,7 @@ from blitzgs.runs.folder_checks import check_room, check_unclaimed, check_writab
 from blitzgs.runs.log import RunLog
 from blitzgs.runs.resume import check_resumable, decided_as, with_pace_of
 from blitzgs.runs.trained_model import Progress, TrainedModel, restore
-from blitzgs.runs.world import check_seen, save_world_frame, trained_columns
+from blitzgs.runs.world import check_seen, gate_of, save_world_frame, trained_columns
 from blitzgs.spawn.gate import lineage_subject, open_spawn_gate
 from blitzgs.spawn.lineage import Ledger, Lineage, initial_births
 from blitzgs.table.blocks import sort_rows
@@ -44,7 +45,7 @@ from blitzgs.training.sampler import BatchSampler, tour_of
 from blitzgs.training.state import Curve, TrainingState
 from blitzgs.training.step import Stepper
 from blitzgs.training.view_level import forget_views
-from blitzgs.view.levels import measure_levels
+from blitzgs.view.levels import Levels, measure_levels
 from blitzgs.view.views import Space, ViewSet, trained_centres
 
 
@@ -88,7 +89,7 @@ def set_up(
     # index of a training view would then belong to other views.
     train_views = train_views_fingerprint(capture)
     same_views = restored is None or restored.progress.train_views in ("", train_views)
-    config = _continued(_resolved(config, capture, restored, same_views), restored, extend, folder)
+    config = _continued(_resolved(config, capture, restored, same_views), restored, extend)
     schedule = Schedule(config.schedule)
     if restored is None:
         table, progress = first_gaussians(config, capture, space, ranks, home)
@@ -174,11 +175,9 @@ def _resolved(config: Config, capture: Capture, restored: TrainedModel | None, s
     return with_pace_of(replace(config, model=model, schedule=schedule, loss=loss), saved)
 
 
-def _continued(config: Config, restored: TrainedModel | None, extend: float | None, folder: Path) -> Config:
+def _continued(config: Config, restored: TrainedModel | None, extend: float | None) -> Config:
     """Return the configuration to begin or continue a run with: `config`, or one with a longer schedule."""
     if restored is None:
-        if extend is not None:
-            raise FileNotFoundError(f"{folder} has no checkpoint: there is no finished run to extend")
         return config
     if extend is not None:
         # An interrupted extension may have left its schedule in the folder's configuration.
@@ -274,7 +273,7 @@ def first_gaussians(
     centres = trained_centres([capture.cameras[i] for i in together], space).to(device)
     levels = measure_levels(points, centres, FORK)
     if config.model.start:
-        table, count, degree = _of_file(config, capture, space, ranks, home)
+        table, count, degree = _of_file(config, capture, space, ranks, home, levels)
         found = count
     else:
         first = octree_gaussians(
@@ -298,9 +297,12 @@ def first_gaussians(
 
 
 def _of_file(
-    config: Config, capture: Capture, space: Space, ranks: Ranks, home: torch.device
+    config: Config, capture: Capture, space: Space, ranks: Ranks, home: torch.device, levels: Levels
 ) -> tuple[GaussianTable, int, int]:
-    """Return a table of this rank's Gaussians of `model.start`, their number on all ranks, and degree."""
+    """Return a table of this rank's Gaussians of `model.start`, their number on all ranks, and degree.
+
+    All have level 0, unless the file has the levels of this run.
+    """
     path, degree, most = Path(config.model.start), config.model.sh_degree, config.population.max_gaussians
     found = read_gaussians(path)
     count, known = len(found), min(found.degree, degree)
@@ -308,5 +310,12 @@ def _of_file(
         limit = f"population.max_gaussians is {most:,}" if count else "a training needs some"
         raise ValueError(f"{path} (model.start) holds {count:,} Gaussians: {limit}")
     check_seen(found, path, capture)
+    gate, _ = gate_of(found, space.unit)
+    if (
+        gate is None
+        or (gate.count, gate.fork) != (levels.count, levels.fork)
+        or not math.isclose(gate.reference_distance, levels.reference_distance, rel_tol=0.01)
+    ):
+        found = replace(found, levels=None)
     columns = trained_columns(with_degree(found, degree), space, ranks)
     return GaussianTable.create({name: column.to(home) for name, column in columns.items()}), count, known

@@ -86,11 +86,6 @@ class Curve:
 _UNCOUNTED = ("setup", "evaluate", "paused", "final_checkpoint")
 
 
-def never() -> bool:
-    """Return False: nothing asks the run to stop."""
-    return False
-
-
 @dataclass
 class TrainingState:
     """One run on one rank; the functions of the events may change it."""
@@ -119,7 +114,7 @@ class TrainingState:
     curve: Curve = field(default_factory=Curve)  # training PSNR of the run
     # Returns whether the run has to stop soon, the same on every rank; long events call it every few seconds.
     # The loop sets it.
-    stops: Callable[[], bool] = never
+    stops: Callable[[], bool] = lambda: False
     # Returns monotonic seconds, by which training time is measured.
     clock: Callable[[], float] = time.monotonic
     _started: float = field(default_factory=time.monotonic)

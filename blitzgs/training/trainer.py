@@ -35,7 +35,6 @@ from blitzgs.training.budget import Budget
 from blitzgs.training.events import evaluate, handle_all, save
 from blitzgs.training.events.evaluate import Glances
 from blitzgs.training.records import (
-    StepRecord,
     describe,
     log_step,
     measure_step,
@@ -46,7 +45,6 @@ from blitzgs.training.records import (
     write_picture,
 )
 from blitzgs.training.setup import set_up
-from blitzgs.training.state import never
 from blitzgs.training.understood import hints_of, largest_size
 from blitzgs.training.watching import Watching
 from blitzgs.util.errors import warn
@@ -85,9 +83,6 @@ class Trainer:
             owners=state.owners if ranks.world_size > 1 else None,
         )
         self._guard = LossGuard()
-        self._unwritten: StepRecord | None = None  # the record of the last step
-        # On CUDA a record is written one step later, so that the host does not wait for its figures.
-        self._writes_late = ranks.device.type == "cuda"
         self._warned_of_masks = False
         self._watching = Watching(state, None)
         self.memory: list[int] = []  # samples of what this rank's GPU has allocated
@@ -119,7 +114,6 @@ class Trainer:
                 state.stops = lambda: agreement.now(state.progress.step).signal is not None
                 if not self._take_steps(agreement):
                     return None
-                self._write_record()
                 self._check_photographs()
                 return self.finish(agreement)
         except PhotographError as error:  # on every rank
@@ -130,7 +124,7 @@ class Trainer:
                 "leave damaged ones out with --data.allow_missing=true"
             ) from error
         finally:
-            state.stops = never
+            state.stops = lambda: False
             self.close()
 
     def _take_steps(self, agreement: Agreement) -> bool:
@@ -152,7 +146,6 @@ class Trainer:
                 self._laps.lap("first step")
                 state.log.event(step * size, "setup", self._laps.seconds, self._laps.text())
             if events := state.schedule.events((step - 1) * size, step * size):
-                self._write_record()
                 with self._saved_for_lack_of_room("an event"):
                     all_ran = handle_all(state, events)
                 if not all_ran:
@@ -181,7 +174,6 @@ class Trainer:
             with state.stage("checkpoint"):
                 save.finish_checkpoint(state)
         if decision.watched:
-            self._write_record()
             self._watching.serve(state.stops)
 
     @contextlib.contextmanager
@@ -210,9 +202,8 @@ class Trainer:
         self._stop(f"stopped by {signal}; continue with --resume", saves)
 
     def _stop(self, reason: str, saves: bool = True) -> None:
-        """Write the log record of the last step, save a checkpoint, and log why the run stops."""
+        """Save a checkpoint, and log why the run stops."""
         if saves:
-            self._write_record()
             save.save_last(self.state, save.STOPPING_PATIENCE_SECONDS, lambda: False)
         self.state.log.event(self.state.images_seen, "stopped", {"reason": reason}, reason)
 
@@ -242,12 +233,10 @@ class Trainer:
         view_filter = view_level.batch_gate(state, batch.indices)
         options = render_options(config, state.space, degree, state.progress.lod_gate(config))
         frame, terms, sums = state.stepper.forward(step, options, batch, view_filter=view_filter)
-        self._write_record()  # whose figures were copied meanwhile
         names = [state.capture.cameras[i].name for i in batch.indices]
         self._guard.check(step, names, sums, state.stepper.table, frame)
         is_logged = end // config.log.every > begin // config.log.every
-        if is_logged:
-            self._unwritten = measure_step(state, frame, batch, sums)
+        figures = measure_step(state, frame, batch) if is_logged else None
         v_means2d = state.stepper.backward(
             step, frame, terms, keep_means2d=schedule.gathers_statistics(begin)
         )
@@ -255,11 +244,11 @@ class Trainer:
             self._add_statistics(frame, v_means2d, reduction)
         state.stepped(step, degree)
         state.log.advance(end)
-        if is_logged:
+        if figures is not None:
             if state.ranks.device.type == "cuda":
                 self.memory.append(memory_bytes(state.ranks.device))
-            if not self._writes_late:
-                self._write_record()
+            # The device has the backward pass to do while the host waits for what was measured before it.
+            log_step(state, figures, sums)
         if is_logged or step == schedule.steps:
             self._check_masks()
 
@@ -276,18 +265,11 @@ class Trainer:
                 "train without them (--data.masks=false)"
             )
 
-    def _write_record(self) -> None:
-        """Write the log record of the last step, if it is not written yet; wait for its figures."""
-        if self._unwritten is not None:
-            log_step(self.state, self._unwritten)
-            self._unwritten = None
-
     def _follow_resolution(self, step: int) -> int:
         """Return by which factor the photographs of a step are reduced; report where it differs."""
         state = self.state
         reduction = state.sampler.reduction(step - 1)
         if reduction != (state.sampler.reduction(step - 2) if step > 1 else 1):
-            self._write_record()
             state.curve.restart()  # reduced photographs have a higher PSNR
             share = f"1/{reduction} of the resolution" if reduction > 1 else "the full resolution"
             text = f"training compares with photographs of {share}"

@@ -274,7 +274,7 @@ def undistortion_note(capture: Capture) -> str | None:
     sizes = Counter(
         ((form.lens.width, form.lens.height), (form.width, form.height))
         for camera in capture.cameras
-        if not getattr(form := camera.rectification, "is_identity", True)
+        if not (form := camera.rectification).is_identity
     )
     if not sizes:
         return None

@@ -14,7 +14,7 @@ from blitzgs.config.fields import FORK, Config
 from blitzgs.table.blocks import morton_order
 
 # Finest sensible voxel relative to the box of the points; it sets the coarsest level's size.
-BASE_RESOLUTION = 0.001
+_BASE_RESOLUTION = 0.001
 # Voxel keys have 21 bits per axis. With this many levels, the finest grid of `measure_levels` uses all of
 # them.
 MAX_LEVELS = 22
@@ -88,19 +88,16 @@ def footprint_levels(sizes: Tensor, reach: float, reference_distance: float, for
     return level.clamp(0, FOOTPRINT_LEVELS - 1).to(torch.uint8)
 
 
-def measure_levels(
-    points: Tensor, centres: Tensor, fork: float, base_resolution: float = BASE_RESOLUTION
-) -> Levels:
+def measure_levels(points: Tensor, centres: Tensor, fork: float) -> Levels:
     """Choose the levels of a scene from its SfM points and training cameras.
 
     d_max and d_min are the 99.9 % and 0.1 % quantiles over cameras of the same quantiles of each camera's
     point distances; d_0 = d_max and K = max(1, round(log_f(d_max / d_min)) + 1). The box is 1.1 times the
     largest extent between the 1 % and 99 % coordinate quantiles, at most 50 times that between the quartiles;
-    level 0 has voxels of box / f^b with b = round(log_2(1 / base_resolution)) - floor(K / 2) + 1.
+    level 0 has voxels of box / f^b with b = round(log_2(1 / _BASE_RESOLUTION)) - floor(K / 2) + 1.
 
     `points`: float64 [M, 3], on any device. `centres`: of the cameras, float64 [V, 3], on the same device.
-    `fork`: f > 1. `base_resolution`: finest sensible voxel relative to the box. ValueError: the cloud or the
-    set of cameras is empty, or all points coincide.
+    `fork`: f > 1. ValueError: the cloud or the set of cameras is empty, or all points coincide.
     """
     if len(points) == 0 or len(centres) == 0:
         raise ValueError(
@@ -119,7 +116,7 @@ def measure_levels(
             "the capture; if it has none (an empty points3D.txt), training starts from random points"
         )
     count = min(MAX_LEVELS, max(1, round(math.log(d_max / d_min, fork)) + 1))
-    base = round(math.log2(1.0 / base_resolution)) - count // 2 + 1
+    base = round(math.log2(1.0 / _BASE_RESOLUTION)) - count // 2 + 1
     return Levels(count=count, fork=fork, reference_distance=d_max, voxel_size=box / fork**base)
 
 

@@ -154,9 +154,8 @@ class Page:
                 return
             visitor.shown = shown
             sharp = ask.scale >= 1.0
-            visitor.client.scene.set_background_image(
-                shown.image, format="jpeg", jpeg_quality=88 if sharp else 70
-            )
+            image, quality = shown.shaded.image, 88 if sharp else 70
+            visitor.client.scene.set_background_image(image, format="jpeg", jpeg_quality=quality)
             if sharp or begin >= visitor.figured + _FIGURES_SECONDS:
                 visitor.figured = begin
                 visitor.figures.content = overlay(visitor, shown, self.memory())

@@ -188,7 +188,7 @@ class Panel:
         shown = visitor.shown
         if shown is None:
             return
-        content = encode_image(torch.from_numpy(shown.image), ".png")
+        content = encode_image(torch.from_numpy(shown.shaded.image), ".png")
         visitor.save(f"{self._exhibit.title}_{time.strftime('%Y%m%d_%H%M%S')}", ".png", content)
 
 
@@ -206,7 +206,7 @@ _GREY = "linear-gradient(90deg,#000,#fff)"
 
 def overlay(visitor: Visitor, shown: Shown, memory: str) -> str:
     """Return the figures of a picture as HTML."""
-    ask, picture = shown.ask, shown.picture
+    ask, picture, shaded = shown.ask, shown.picture, shown.shaded
     look = ask.look
     place = visitor.world.capture_position(visitor.stance.position)
     lines = [
@@ -215,15 +215,15 @@ def overlay(visitor: Visitor, shown: Shown, memory: str) -> str:
         "x {:.2f} &nbsp;y {:.2f} &nbsp;z {:.2f}".format(*place),
         *((escape(frame.label(place)),) if (frame := visitor.exhibit.frame) is not None else ()),
     ]
-    if ask.camera is not None and shown.psnr is not None:
+    if ask.camera is not None and shaded.psnr is not None:
         name = visitor.exhibit.cameras[ask.camera].name
         part = "held out" if ask.camera in set(visitor.exhibit.test) else "trained on"
-        lines.append(f"{escape(name)} ({part}) &middot; <b>{shown.psnr:.2f} dB</b>")
-    if shown.low is not None and shown.high is not None:
+        lines.append(f"{escape(name)} ({part}) &middot; <b>{shaded.psnr:.2f} dB</b>")
+    if shaded.low is not None and shaded.high is not None:
         colours = {"depth": _TURBO, "count": _INFERNO}.get(look.mode, _GREY)
         lines.append(
-            f"{look.mode} {shown.low:.3g} <span style='display:inline-block;width:120px;height:9px;"
-            f"background:{colours}'></span> {shown.high:.3g}"
+            f"{look.mode} {shaded.low:.3g} <span style='display:inline-block;width:120px;height:9px;"
+            f"background:{colours}'></span> {shaded.high:.3g}"
         )
     if look.mode == "level":
         boxes = "".join(_level(k, colour) for k, colour in enumerate(LEVEL_COLOURS))

@@ -124,7 +124,7 @@ def _open_file(path: Path, ranks: Ranks, paths: Path, most: int | None) -> Opene
     # Centred, so that float32 resolves the positions of a georeferenced model as finely as the file does.
     space = Space.of(middle + np.array(offset_of(found.comments)), max(extent, 1e-6))
     config = Config(model=ModelConfig(antialiased=is_antialiased(found), near=1e-3))
-    subject = subject_of_file(found, config, space, ranks, most_kept=0.95)
+    subject = subject_of_file(found, config, space, ranks)
     lod = subject.lod
     exhibit = Exhibit(
         title=path.name,

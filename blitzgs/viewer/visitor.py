@@ -56,10 +56,7 @@ class Shown:
 
     ask: Ask
     picture: Picture
-    image: npt.NDArray[np.uint8]  # [H, W, 3]; this and the rest as in `Shaded`
-    low: float | None
-    high: float | None
-    psnr: float | None
+    shaded: Shaded  # what the page shows of the picture
 
 
 class Visitor:
@@ -134,7 +131,7 @@ class Visitor:
         shown = self.shown
         if shown is None:
             return True
-        height, width = shown.image.shape[:2]
+        height, width = shown.shaded.image.shape[:2]
         return abs(width / height / self.client.camera.aspect - 1) > 0.05
 
     def _tell(self) -> None:
@@ -260,10 +257,10 @@ class Visitor:
             try:
                 photograph = self.exhibit.photograph(ask.camera)
             except (OSError, ValueError, RuntimeError):
-                return Shown(ask, picture, *result)
+                return Shown(ask, picture, result)
             camera, kind, wipe = self.exhibit.cameras[ask.camera], ask.settings.comparison, ask.settings.wipe
             result = compare.compare(kind, result.image, photograph, camera, ask.look.K, wipe, ask.columns)
-        return Shown(ask, picture, *result)
+        return Shown(ask, picture, result)
 
     def _step_to_ground(self, ask: Ask, picture: Picture) -> None:
         known = picture.values[picture.values > 0]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 IMAGES = Path(__file__).resolve().parents[1] / "images"
 VIEW = "00040_oblique_e.jpg"  # held out
 PHOTOGRAPHS = (2, 26, 42, 58)  # in the order of their names
-EVALUATE_EVERY = 1250  # times the scale of the recipe: every 250 images
+EVALUATE_EVERY = 250  # images
 GAP = 6
 
 

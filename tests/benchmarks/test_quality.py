@@ -20,7 +20,7 @@ from opponents.spatial_partition import HALO, LEAST_SEEN, Grid, coverage, divide
 from quality_plan import SAFE, RunSpec, runs_of
 
 from blitzgs.distributed.group import Ranks
-from tests.helpers import DEVICES, refused
+from tests.helpers import refused
 from tests.training.tiny import OVERRIDES, tiny_scene
 
 FLAGS = " ".join(f"--{text}" for text in OVERRIDES)
@@ -96,7 +96,6 @@ def test_settings_tell_recipes_apart_but_not_seeds_or_places(capture):
     assert mcmc.options() == GsplatOptions.of("mcmc", {"cap_max": 1_000_000})
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("strategy", ["default", "default-reset", "mcmc"])
 def test_gsplats_strategies_train(capture, strategy, device):
     pytest.importorskip("gsplat")

@@ -15,8 +15,6 @@ import pytest
 import report
 import report_tables
 
-from tests.helpers import needs_cuda
-
 PAGE = "before\n<!-- table: {0} -->\nold\n<!-- end: {0} -->\nafter\n"
 
 
@@ -88,7 +86,6 @@ def test_a_copy_without_a_repository_has_no_commit(monkeypatch, tmp_path):
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_render_and_step_write_what_the_report_reads(tmp_path, monkeypatch):
     import bm_render
     import bm_step

@@ -11,15 +11,7 @@ from scipy.special import sph_harm_y
 import blitzgs
 from blitzgs.call.covariances import decompose
 from blitzgs.reference.projection import covariance_factors
-from tests.helpers import (
-    BACKENDS,
-    DEVICES,
-    agree,
-    random_scene,
-    rasterize_scene,
-    refused,
-    relative_error,
-)
+from tests.helpers import agree, random_scene, rasterize_scene, refused, relative_error
 from tests.population.test_relocation import by_the_double_sum
 
 
@@ -30,7 +22,6 @@ def shapes(*lead, dtype=torch.float64, device="cpu"):
     return quats.to(device, dtype), scales.to(device, dtype)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("triu", [False, True])
 def test_covariances_and_their_inverses(backend, triu):
     device, dtype = backend
@@ -54,7 +45,6 @@ def test_covariances_have_gradients():
         blitzgs.quat_scale_to_covar_preci(scales, scales)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("min_opacity", [0.0, 0.005])
 def test_relocation_is_the_paper_s_double_sum(backend, min_opacity):
     device, dtype = backend
@@ -73,7 +63,6 @@ def test_relocation_is_the_paper_s_double_sum(backend, min_opacity):
     refused(ValueError, r"ratios must be \[N\]", blitzgs.relocate, opacities[:, None], scales, ratios)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_noise_has_the_covariance_of_the_paper(device):
     n, scaler, threshold = 40_000, 2.5, 0.01
     quats, scales = (t[:1].expand(n, -1).contiguous() for t in shapes(1, dtype=torch.float32, device=device))
@@ -104,7 +93,6 @@ def test_wrong_points_and_opacities_are_named():
     ids=str,
 )
 @pytest.mark.parametrize("size", [1e-20, 1, 1e15])
-@pytest.mark.parametrize("device", DEVICES)
 def test_decomposed_covariances_are_the_given_ones(device, size, scales):
     g = torch.Generator().manual_seed(0)
     quats = torch.randn(500, 4, generator=g, dtype=torch.float64)
@@ -130,7 +118,6 @@ def image_of(ids, weights, values):
 
 
 @pytest.mark.parametrize("packed", [True, False])
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_the_image_is_the_sum_over_all_contributors(backend, packed):
     scene = random_scene(cameras=3).to(backend[1], backend[0])
     values = torch.rand(60, 3, generator=torch.Generator().manual_seed(2)).to(scene.means)

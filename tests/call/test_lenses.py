@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import blitzgs
-from tests.helpers import BACKENDS, random_scene, rasterize_scene, refused
+from tests.helpers import random_scene, rasterize_scene, refused
 
 BROWN = (-0.2, 0.05, 0.0, 0.0, 0.0, 0.0, 0.005, -0.008, 0.002, 0.0, -0.003, 0.0)
 FISHEYE = (0.05, -0.02, 0.01, 0.0)
@@ -117,7 +117,6 @@ def test_each_row_of_a_rolling_shutter_is_that_of_the_pose_at_its_time(shutter):
     assert (same - still).abs().max() < 1e-12
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_batches_arrangements_and_pixels_have_the_same_image(backend):
     device, dtype = backend
     scene = wide_scene(n=200, cameras=2, dtype=dtype, device=device)

@@ -11,7 +11,7 @@ from torch.utils._pytree import tree_map
 
 from blitzgs.call import bad_values
 from blitzgs.call.meta import LATER, LateMapping, LazyDict
-from tests.helpers import DEVICES, random_scene, rasterize_scene, reference_images, refused, relative_error
+from tests.helpers import random_scene, rasterize_scene, reference_images, refused, relative_error
 
 
 @pytest.fixture(autouse=True)
@@ -69,7 +69,6 @@ def test_packed_and_dense_meta_say_the_same():
     assert (dense["radii"][invisible] == 0).all()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_meta_may_be_changed_in_place(device):
     scene = random_scene(n=40, device=device).leaves()
     for _ in range(2):  # the second call has enough capacity
@@ -92,7 +91,6 @@ def test_meta_read_late_is_differentiable_as_the_call_was():
     assert scene.means.grad.any()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("packed", [False, True])
 def test_meta_lists_only_what_touches_a_tile(device, packed):
     """The lists of meta leave out Gaussians whose colour is not finite."""
@@ -106,7 +104,6 @@ def test_meta_lists_only_what_touches_a_tile(device, packed):
     assert (gaussians % 3 != 0).all()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_meta_lists_are_sorted_and_consistent(device):
     scene = random_scene(n=90, cameras=2, width=50, height=37, device=device)
     _, _, meta = rasterize_scene(scene, tile_size=8)
@@ -129,7 +126,6 @@ def test_meta_lists_are_sorted_and_consistent(device):
 LAID_OUT = ("means2d", "conics", "opacities", "depths")
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_packed_rows_stand_image_after_image(device):
     scene = random_scene(n=70, cameras=3, device=device)
     _, _, meta = rasterize_scene(scene)
@@ -144,7 +140,6 @@ def test_packed_rows_stand_image_after_image(device):
     assert torch.equal(meta["flatten_ids"], torch.cat(rows).int())
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("packed", [True, False])
 @pytest.mark.parametrize("cameras", [1, 3])
 def test_rendered_columns_of_meta_have_gradients(device, packed, cameras):
@@ -168,7 +163,6 @@ def test_rendered_columns_of_meta_have_gradients(device, packed, cameras):
             assert not gradient[unseen].any()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_packed_and_dense_meta_have_the_same_gradients(device):
     dtype, bound = (torch.float64, 1e-12) if device == "cpu" else (torch.float32, 1e-4)
     scene = random_scene(n=40, cameras=3, dtype=dtype, device=device).leaves()
@@ -191,7 +185,6 @@ def test_dense_opacities_are_those_of_all_gaussians():
     assert torch.equal(scene.opacities.grad, torch.full((30,), 2.0))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_absgrad_needs_no_gradient_of_a_leaf(device):
     scene = random_scene(n=30, cameras=1, device=device).leaves()
     found = []
@@ -208,7 +201,6 @@ def test_absgrad_needs_no_gradient_of_a_leaf(device):
     assert all(relative_error(absolute, found[0]) <= bound for absolute in found)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_tree_map_reaches_into_meta(device):
     _, _, meta = rasterize_scene(random_scene(n=30, device=device))
     doubled = tree_map(lambda value: value * 2 if isinstance(value, torch.Tensor) else value, meta)
@@ -218,7 +210,6 @@ def test_tree_map_reaches_into_meta(device):
     assert doubled["width"] == meta["width"]
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks"])
 def test_what_is_not_finite_is_named(device, name):
     scene = random_scene(n=31, cameras=2, device=device)
@@ -232,7 +223,6 @@ def test_what_is_not_finite_is_named(device, name):
     assert {key: value.tolist() for key, value in meta["non_finite"].items()} == {name: [at]}
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", ["viewmats", "Ks"])
 def test_a_bad_camera_is_named_in_every_call(device, name):
     scene = random_scene(n=44, cameras=2, device=device)
@@ -243,7 +233,6 @@ def test_a_bad_camera_is_named_in_every_call(device, name):
         rasterize_scene(scene)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("per_view", [False, True])
 @pytest.mark.parametrize("channels", [4, 150])
 def test_a_colour_that_is_not_finite_is_named(device, per_view, channels):
@@ -259,7 +248,6 @@ def test_a_colour_that_is_not_finite_is_named(device, per_view, channels):
     assert {key: value.tolist() for key, value in meta["non_finite"].items()} == {"colors": [5]}
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("length", [0.0, 1e-40])
 def test_a_zero_quaternion_is_the_identity_and_not_named(device, length, recwarn):
     scene = random_scene(n=49, cameras=2, device=device)

@@ -7,21 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import blitzgs
 from blitzgs.runs.cameras import checked_camera
-from tests.helpers import (
-    DEVICES,
-    agree,
-    image_error,
-    random_scene,
-    rasterize_scene,
-    reference_images,
-    refused,
-)
+from tests.helpers import agree, image_error, random_scene, rasterize_scene, reference_images, refused
 
 IMAGE_BOUND = {torch.float32: 1e-5, torch.float64: 1e-10}
 GRADIENT_BOUND = {torch.float32: 1e-4, torch.float64: 1e-10}
@@ -92,7 +84,6 @@ def test_random_scenes_against_the_reference(seed, n, scale, degree, width, heig
     require_accurate(scene)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_the_signs_of_scales_do_not_matter(device):
     scene = random_scene(n=60, width=24, height=20, device=device)
     scene.means *= 2.0  # some centres are outside of the images
@@ -105,7 +96,6 @@ def test_the_signs_of_scales_do_not_matter(device):
     agree(*results, 1e-5)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_call_does_not_depend_on_those_before(device):
     """The sizes of earlier calls decide the next call's first capacity, but not its results."""
     few, many = (random_scene(n=n, width=33, height=17, device=device).leaves() for n in (5, 3000))
@@ -123,7 +113,6 @@ def test_a_call_does_not_depend_on_those_before(device):
     agree(gradients, first[1], 1e-5)  # atomic sums are in no particular order
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_value_that_is_not_finite_spreads_to_no_pixel(device):
     scene = random_scene(n=30, cameras=1, device=device)
     scene.sh_degree = None
@@ -182,7 +171,6 @@ def render(name, matrices, device="cpu", count=5, depth=3.0, views=0, scenes=1, 
     return blitzgs.rasterization(*given, 32, 24, **options)[0]
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", CALLS)
 def test_a_renderer_refuses_intrinsics_of_no_pinhole(name, device):
     good = np.array(GOOD)
@@ -192,7 +180,6 @@ def test_a_renderer_refuses_intrinsics_of_no_pinhole(name, device):
             render(name, [good, wrong(*entry)], device, **CALLS[name])
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_intrinsics_that_are_not_finite_or_rounded_are_no_error(device):
     rounded = np.array(GOOD)
     rounded[0, 1], rounded[2, 2] = 1e-6, 1 + 1e-7
@@ -219,7 +206,9 @@ def test_a_pose_has_a_last_row():
 
 GAUSSIANS = ("means", "quats", "scales", "opacities", "colors")
 seeds = st.integers(0, 10**6)
-quickly = settings(max_examples=5, deadline=None, derandomize=True)
+# The fixture `device` has no state that examples could share.
+stateless = [HealthCheck.function_scoped_fixture]
+quickly = settings(max_examples=5, deadline=None, derandomize=True, suppress_health_check=stateless)
 
 
 def image_of(scene, **options):
@@ -230,7 +219,6 @@ def select(scene, index):
     return replace(scene, **{name: getattr(scene, name)[index] for name in GAUSSIANS})
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @quickly
 @given(seed=seeds)
 def test_the_order_of_the_gaussians_does_not_matter(device, seed):
@@ -260,7 +248,6 @@ def test_world_and_cameras_move_together(seed):
     assert ((image_of(scene) - before).abs() > 1e-10).double().mean() < 0.002  # flips at the cuts
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @quickly
 @given(seed=seeds, exponent=st.integers(-20, 20))
 def test_a_world_scaled_by_a_power_of_two_gives_the_same_bits(device, seed, exponent):
@@ -279,7 +266,6 @@ def test_tiles_change_no_bit(seed, tile_size):
     assert torch.equal(image_of(scene, tile_size=tile_size), image_of(scene))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_views_together_equal_views_alone(device):
     scene = random_scene(n=80, cameras=4, device=device).leaves()
     generator = torch.Generator().manual_seed(0)
@@ -294,7 +280,6 @@ def test_views_together_equal_views_alone(device):
     agree(scene.gradients(), parts.gradients(), 1e-6 if device == "cpu" else 1e-5)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_transparent_gaussians_change_no_bit(device):
     scene = random_scene(n=60, device=device)
     without = image_of(select(scene, torch.arange(0, 60, 2)))
@@ -306,7 +291,6 @@ def test_transparent_gaussians_change_no_bit(device):
     assert all((getattr(leaves, name).grad[1::2] == 0).all() for name in GAUSSIANS)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("n, cameras", [(0, 2), (0, 1), (3, 0)])
 @pytest.mark.parametrize("render_mode", ["RGB", "RGB+ED"])
 @pytest.mark.parametrize("packed", [True, False])

@@ -6,7 +6,7 @@ import torch
 
 import blitzgs
 from blitzgs.optim import LazyAdam
-from tests.helpers import BACKENDS, DEVICES, needs_cuda, random_scene, refused, relative_error
+from tests.helpers import random_scene, refused, relative_error
 
 NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
@@ -40,7 +40,6 @@ def raw(p, scene, **options):
     )
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("sparse_grad", [True, False])
 @pytest.mark.parametrize("cameras", [1, 40])
 def test_parameters_of_nerfstudio_and_inria_are_taken_as_they_are(device, sparse_grad, cameras):
@@ -68,7 +67,6 @@ def test_parameters_of_nerfstudio_and_inria_are_taken_as_they_are(device, sparse
         assert torch.equal(actual, expected) if device == "cpu" else relative_error(actual, expected) < 0.05
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(
     "options", [{}, {"render_mode": "RGB+ED"}, {"rasterize_mode": "antialiased"}], ids=str
 )
@@ -96,7 +94,6 @@ def test_it_renders_what_activated_parameters_render(backend, options, cameras):
     assert own_meta["means2d"].grad.any()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_gradients_may_be_dense_and_sh_one_tensor(device):
     scene = spread(random_scene(n=60, device=device))
     expected, split = raw_parameters(scene), raw_parameters(scene)
@@ -118,7 +115,6 @@ def test_depth_has_no_gradient_of_sh():
     assert p["means"].grad is not None and p["sh0"].grad is None and p["shN"].grad is None
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_nothing_visible_is_an_empty_image(device):
     scene = random_scene(n=20, device=device)
     scene.means += 1e4
@@ -129,7 +125,6 @@ def test_nothing_visible_is_an_empty_image(device):
     assert p["means"].grad.coalesce().values().shape == (0, 3)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_gradients_add_up_after_a_view_of_nothing(device):
     """Torch adds to an empty sparse gradient in place."""
     scene = spread(random_scene(n=60, cameras=3, width=20, height=16, device=device))
@@ -142,7 +137,6 @@ def test_gradients_add_up_after_a_view_of_nothing(device):
         assert relative_error(sparse[name].grad.to_dense(), dense[name].grad) < 1e-4, name
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("in_one", [True, False])
 def test_lazy_steps_are_those_of_dense_adam(backend, in_one):
     """Views take turns, so most rows have pending steps when they are next seen."""
@@ -269,7 +263,6 @@ def test_sparse_gradients_need_leaves():
     raw(p, scene, render_mode="D")[0].sum().backward()  # SH get no gradient
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_gradients_of_two_views_may_come_at_once(device):
     """The second view catches up rows that the first one read, which must not spoil the first's gradient."""
     scene = random_scene(n=50, cameras=2, width=20, height=16, device=device)
@@ -293,7 +286,6 @@ def test_gradients_of_two_views_may_come_at_once(device):
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_a_call_is_repeated_if_there_was_too_little_room():
     """A first view sees a few Gaussians, so that the next one needs more than was estimated."""
     scene = random_scene(n=2000, cameras=2, width=96, height=80, device="cuda")
@@ -316,7 +308,6 @@ def test_a_call_is_repeated_if_there_was_too_little_room():
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_memory_follows_what_is_visible():
     scene = random_scene(n=1000, cameras=1, device="cuda")
     p = raw_parameters(scene)
@@ -335,7 +326,6 @@ def test_memory_follows_what_is_visible():
     assert peak < 40e6  # 1 M Gaussians have 236 MB of parameters
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_the_default_device_of_torch_has_no_effect(device):
     scene = spread(random_scene(n=40, device=device))
     targets = torch.full((2, scene.height, scene.width, 3), 0.5, device=device)

@@ -10,7 +10,7 @@ import torch
 import blitzgs
 from blitzgs.reference.projection import covariance_factors
 from tests.call.test_lenses import RollingShutterType
-from tests.helpers import DEVICES, PARAMETERS, agree, random_scene, rasterize_scene, refused, relative_error
+from tests.helpers import PARAMETERS, agree, random_scene, rasterize_scene, refused, relative_error
 
 PER_ROW = ("radii", "means2d", "depths", "conics", "opacities", "tiles_per_gauss")
 
@@ -21,7 +21,6 @@ def batch_of(scenes):
     return replace(scenes[0], **stacked)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("packed", [True, False])
 @pytest.mark.parametrize("colors", ["sh", "values", "values per view", "sh per view"])
 def test_a_batch_renders_as_its_scenes_alone(device, packed, colors):
@@ -72,7 +71,6 @@ def test_a_batch_may_have_several_dimensions():
         assert torch.equal(meta["means2d"].reshape(-1, 2), flat_meta["means2d"].reshape(-1, 2))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("with_sh", [True, False])
 def test_any_number_of_views(device, with_sh):
     scene = random_scene(n=30, cameras=70, width=9, height=8, device=device)
@@ -92,7 +90,6 @@ def test_any_number_of_views(device, with_sh):
     agree(leaves.gradients(), parts.gradients(), 1e-4)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_sh_may_differ_from_view_to_view(device):
     scene = random_scene(n=40, cameras=3, device=device)
     per_view = torch.randn(3, 40, 16, 3, generator=torch.Generator().manual_seed(1)).to(device) * 0.4
@@ -107,7 +104,6 @@ def test_sh_may_differ_from_view_to_view(device):
         assert relative_error(leaves.colors.grad[view], one.colors.grad) < 1e-5
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_sh_of_no_views_have_images_and_gradients(device):
     scene = random_scene(n=10, cameras=1, device=device).leaves()
     scene.colors = torch.zeros(0, 10, 16, 3, device=device, requires_grad=True)
@@ -118,7 +114,6 @@ def test_sh_of_no_views_have_images_and_gradients(device):
     assert scene.colors.grad.shape == (0, 10, 16, 3) and not scene.means.grad.any()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("mode", ["D", "ED"])
 def test_depth_needs_no_colours(device, mode):
     scene = random_scene(n=30, device=device)
@@ -134,7 +129,6 @@ def covariances(scene):
     return (factors @ factors.mT).view(*scene.scales.shape[:-1], 3, 3)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
 def test_covariances_are_rotations_and_scales(device, rasterize_mode):
     dtype = torch.float64 if device == "cpu" else torch.float32
@@ -165,7 +159,6 @@ def test_covariances_have_no_sparse_gradients():
         rasterize_scene(scene, covars=covars, sparse_grad=True)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_covariances_of_a_batch(device):
     scenes = [random_scene(n=20, cameras=2, seed=seed, device=device) for seed in range(2)]
     batch = batch_of(scenes)

@@ -12,16 +12,7 @@ import blitzgs
 from blitzgs.reference import render
 from blitzgs.reference.projection import normals, sh_colors, sh_values
 from blitzgs.reference.render import composited_weights, median_splats
-from tests.helpers import (
-    BACKENDS,
-    DEVICES,
-    agree,
-    image_error,
-    random_scene,
-    rasterize_scene,
-    refused,
-    relative_error,
-)
+from tests.helpers import agree, image_error, random_scene, rasterize_scene, refused, relative_error
 
 E = 5
 # Largest error against float64, by dtype, of images and of gradients.
@@ -67,7 +58,6 @@ def images_of(scene, **options):
 
 
 @pytest.mark.parametrize("degree,per_view", [(None, False), (None, True), (2, False)])
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_images_and_gradients_are_those_of_the_definition(backend, degree, per_view):
     device, dtype = backend
     scene = random_scene(cameras=2, seed=3).to(dtype, device)
@@ -95,7 +85,6 @@ def test_images_and_gradients_are_those_of_the_definition(backend, degree, per_v
 
 
 @pytest.mark.parametrize("packed", [True, False])
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_colours_keep_their_bits_and_layouts_agree(backend, packed):
     scene = random_scene().to(backend[1], backend[0])
     for mode in ("RGB", "RGB+D", "RGB+ED", "ED"):
@@ -141,7 +130,6 @@ def compiled(function):
     return torch.compile(function, fullgraph=True, backend="aot_eager")
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("transform", [around, compiled])
 def test_checkpointing_and_compiling_change_nothing(device, transform):
     scene = random_scene(n=40, device=device)
@@ -253,7 +241,6 @@ def chosen_of(device, count=25):
 
 
 @pytest.mark.parametrize("packed", [True, False])
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_pixels_and_gradients_are_those_of_the_image(backend, packed):
     pixels, images = chosen_of(backend[0])
     at = (images, *pixels.T)
@@ -278,7 +265,6 @@ def test_pixels_and_gradients_are_those_of_the_image(backend, packed):
     agree(*gradients, 1e-12 if backend[1] == torch.float64 else 1e-4)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_every_pixel_and_no_pixel(backend):
     scene = random_scene(cameras=1).to(backend[1], backend[0])
     image, alphas, _ = rasterize_scene(scene)

@@ -42,9 +42,10 @@ def smooth_image(height: int, width: int, seed: int = 0) -> np.ndarray:
     return cv2.resize(noise, (width, height), interpolation=cv2.INTER_CUBIC)
 
 
-def write_image(path: Path, rgb: np.ndarray) -> None:
+def write_image(path: Path, pixels: np.ndarray, *flags: int) -> None:
+    """Write RGB [H, W, 3] or grey [H, W], with OpenCV's flags."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), rgb[..., ::-1])
+    assert cv2.imwrite(str(path), pixels if pixels.ndim == 2 else pixels[..., ::-1], flags)
 
 
 def reconstruction(

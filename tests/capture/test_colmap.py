@@ -141,12 +141,6 @@ def test_damage_is_named_with_file_place_and_reason(tmp_path, file, content, mes
     refused(ValueError, message, colmap.read_model, tmp_path, points2d=True, tracks=True)
 
 
-def test_a_missing_file_is_named(tmp_path):
-    reconstruction(NAMES, 64, 48).write_binary(str(tmp_path))
-    (tmp_path / "images.bin").unlink()
-    refused(FileNotFoundError, "images.bin is missing", colmap.read_model, tmp_path)
-
-
 def test_the_complete_model_is_read_where_files_of_another_kind_are_left(tmp_path):
     rec = reconstruction(NAMES[:1], 64, 48)
     rec.write_text(str(tmp_path))

@@ -35,18 +35,6 @@ def test_images_are_rgb_grey_ones_too(tmp_path):
     np.testing.assert_array_equal(shown[1].numpy(), smooth_image(48, 64, seed=1))
 
 
-def test_the_same_bits_for_every_budget_thread_count_and_order(capture):
-    ample, tight = (
-        ImageStore(capture),
-        ImageStore(capture, budget_bytes=2000, threads=3, decoded_bytes=IMAGE_BYTES),
-    )
-    first = [ample.get(i).clone() for i in range(12)]
-    tight.prefetch(range(12))
-    for i in [5, 3, 5, 11, 0, 1, 2, 3, 4, 6, 7, 8, 9, 10]:
-        assert torch.equal(tight.get(i), first[i])
-    assert tight.decoded.bytes <= IMAGE_BYTES and tight.compressed.bytes <= 2000
-
-
 def test_files_are_read_once_within_the_budget(capture):
     store = ImageStore(capture, decoded_bytes=0)
     before = [store.get(i).clone() for i in range(12)]
@@ -228,13 +216,6 @@ def test_a_frame_of_motion_jpeg_has_no_huffman_tables(tmp_path):
     np.testing.assert_array_equal(decode_rgb(read_whole(path)), expected)
     path.write_bytes(data[:-100] + data[-2:])
     refused(ValueError, "image data end before the last block", read_whole, path)
-
-
-def test_floating_point_pixels_with_alpha_are_refused_by_name(tmp_path):
-    root = write_capture(tmp_path, ["a.tif"], width=64, height=48)
-    cv2.imwrite(str(root / "images" / "a.tif"), np.ones((48, 64, 4), dtype=np.float32))
-    with pytest.raises(ValueError, match="a.tif: pixels must be of 8 or 16 bits, got float32"):
-        ImageStore(load_capture(root)).get(0)
 
 
 def test_a_file_that_changed_its_size_is_refused(capture):

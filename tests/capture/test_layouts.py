@@ -126,15 +126,13 @@ def test_blender_transforms(tmp_path):
         ({"mask_path": 3}, "frame 0: mask_path must name a file, got 3"),
         ({"mask_path": ""}, "frame 0: mask_path must name a file, got ''"),
         ({"is_fisheye": True, "camera_model": "OPENCV"}, "frame 0: is_fisheye is true but camera_model is"),
-        ({"k1": 1e300}, "the camera of .*a.png: the lens does not see along its own axis"),
+        ({"k1": 1e300}, "a.png: the lens does not see along its own axis"),
     ],
 )
 def test_transforms_that_make_no_sense_are_named(tmp_path, fields, message):
     write_image(tmp_path / "a.png", smooth_image(48, 64))
     write_transforms(tmp_path, [frame("a.png", fl_x=60.0) | fields], **fields)
-    with pytest.raises(ValueError, match=message) as caught:
-        load_capture(tmp_path)
-    assert str(tmp_path) in str(caught.value)
+    refused(ValueError, f"{tmp_path}.*{message}", load_capture, tmp_path)
 
 
 @pytest.mark.parametrize("again", ["a.png", "./a.png", "a"])
@@ -149,9 +147,8 @@ def test_missing_images_of_transforms_are_named_by_their_paths(tmp_path):
     """The folder `images` and the flag data.images have no meaning for them."""
     frames = [frame("photos/a.png"), frame("photos/b.png", np.diag([-1.0, -1.0, 1.0, 1.0]))]
     write_transforms(tmp_path, frames, w=64, h=48, fl_x=50.0)
-    with pytest.raises(FileNotFoundError, match="correct file_path in its transforms.json") as caught:
-        load_capture(tmp_path)
-    assert f"2 of 2 images are not in {tmp_path}: photos/a.png, photos/b.png;" in str(caught.value)
+    message = f"2 of 2 images are not in {tmp_path}: photos/a.png, photos/b.png;.*correct file_path in its"
+    refused(FileNotFoundError, message, load_capture, tmp_path)
     write_image(tmp_path / "photos" / "a.png", smooth_image(48, 64))
     with pytest.raises(MissingImagesError, match=f"1 of 2 images are not in {tmp_path}: photos/b.png;"):
         load_capture(tmp_path, split=0)
@@ -159,10 +156,9 @@ def test_missing_images_of_transforms_are_named_by_their_paths(tmp_path):
 
 def test_nerfstudio_transforms_with_distortion_masks_points_and_split(tmp_path):
     frames = []
-    (tmp_path / "own").mkdir()
     for i in range(4):
         write_image(tmp_path / "images" / f"f{i}.png", smooth_image(48, 64, i))
-        cv2.imwrite(str(tmp_path / "own" / f"f{i}.png"), np.zeros((48, 64), dtype=np.uint8))
+        write_image(tmp_path / "own" / f"f{i}.png", np.zeros((48, 64), dtype=np.uint8))
         masks = [{}, {"mask_path": f"own/f{i}.png"}, {"mask_path": None}, {}][i]
         frames.append(frame(f"images/f{i}.png", at(i, 0, 0), **masks))
     write_ply(tmp_path / "p.ply", [[1, 2, 3], [4, 5, 6]], [[9, 8, 7], [1, 2, 3]])
@@ -214,6 +210,4 @@ def test_errors_name_the_file(tmp_path):
         (without_pose, "frame 0: the field transform_matrix"),
     ):
         file.write_text(text)
-        with pytest.raises(ValueError, match=reason) as raised:
-            read_cameras(file, np.zeros(3))
-        assert str(file) in str(raised.value)
+        refused(ValueError, f"{file}.*{reason}", read_cameras, file, np.zeros(3))

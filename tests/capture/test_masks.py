@@ -106,9 +106,8 @@ def test_labels_of_all_brightnesses_count_whatever_they_are():
 def test_masks_without_effect_are_said(tmp_path, name, mask, message):
     names = [name, name.replace("a", "b")]
     root = write_capture(tmp_path, names)
-    (root / "masks").mkdir()
     for file in names:
-        cv2.imwrite(str(root / "masks" / file), mask.astype(np.uint8))
+        write_image(root / "masks" / file, mask.astype(np.uint8))
     warned(message, load_capture, root)
 
 
@@ -193,13 +192,12 @@ def test_messages_about_masks_speak_of_masks(tmp_path):
 
 def test_a_photograph_is_not_taken_for_its_own_mask(tmp_path):
     """Absolute names and `..`, joined to the folder of masks, would lead to the photographs."""
-    (tmp_path / "photos").mkdir()
     (tmp_path / "capture" / "masks").mkdir(parents=True)
     write_image(tmp_path / "photos" / "a.png", smooth_image(64, 48))
     photo = str(tmp_path / "photos" / "a.png")
     for name in (photo, "../../photos/a.png"):
         assert find_masks(tmp_path / "capture", None, [name], [None]) == [None]
-    cv2.imwrite(str(tmp_path / "capture" / "masks" / "a.png"), np.ones((4, 4), dtype=np.uint8))
+    write_image(tmp_path / "capture" / "masks" / "a.png", np.ones((4, 4), dtype=np.uint8))
     found = find_masks(tmp_path / "capture", None, [photo], [None])
     assert found == [tmp_path / "capture" / "masks" / "a.png"]
 

@@ -15,7 +15,7 @@ from blitzgs.capture.images import ImageStore, decoded_shapes
 from blitzgs.capture.pictures import comparison, error_map, save_image, strip, to_uint8
 from blitzgs.capture.shared_images import SharedImages, size_of
 from blitzgs.training import inputs
-from tests.capture.helpers import write_capture
+from tests.capture.helpers import write_capture, write_image
 from tests.distributed.rank_harness import run_ranks
 from tests.helpers import refused
 from tests.training.tiny import tiny_config
@@ -96,7 +96,7 @@ def test_turned_photographs_are_shared_too(tmp_path):
 def test_masks_are_shared_too(tmp_path):
     capture = load_capture(write_capture(tmp_path, NAMES[:2]))
     mask = tmp_path / "mask.png"
-    cv2.imwrite(str(mask), 255 * (noise((48, 64)) > 99).astype(np.uint8))
+    write_image(mask, 255 * (noise((48, 64)) > 99).astype(np.uint8))
     cameras = [dataclasses.replace(camera, mask_path=mask) for camera in capture.cameras]
     capture = dataclasses.replace(capture, cameras=cameras)
     shapes = decoded_shapes(capture, [4])

@@ -80,8 +80,7 @@ def test_invalid_splits_are_refused(tmp_path):
     for number in (1, "-1"):
         message = f"data.split: must be 0 .no view is held out. or at least 2, got {number}"
         refused(ValueError, message, split, ROOT, number)
-    with pytest.raises(ValueError, match=r"must be a whole number n .*, 'auto', 'val' or a file"):
-        split(ROOT, "missing.txt")
+    refused(ValueError, "must be a whole number n .*, 'auto', 'val' or a file", split, ROOT, "missing.txt")
     (tmp_path / "all.txt").write_text("\n".join(NAMES))
     refused(ValueError, "leaves no training view of 4", split, tmp_path, "all.txt")
 

@@ -180,23 +180,6 @@ def test_wrong_flags_are_named(trained, tmp_path, monkeypatch, failure, flags, r
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_interrupted_film_leaves_nothing(trained, tmp_path, monkeypatch):
-    from blitzgs.cli import render
-
-    real, calls = render.render_view, []
-
-    def interrupted(*arguments):
-        calls.append(0)
-        if len(calls) == 3:
-            raise KeyboardInterrupt
-        return real(*arguments)
-
-    monkeypatch.setattr(render, "render_view", interrupted)
-    flags = ["--path", "orbit", "--size", "48x32", "--out", str(tmp_path / "f.mp4")]
-    assert main(["render", str(trained[1]), *flags]) == 130
-    assert len(calls) == 3 and list(tmp_path.iterdir()) == []
-
-
 def _command(rank, arguments):
     return main(arguments)
 

@@ -18,7 +18,6 @@ from blitzgs.config.files import (
     REMOVED,
     ConfigError,
     config_hash,
-    default_recipe,
     from_dict,
     load_config,
     recipe_names,
@@ -26,7 +25,7 @@ from blitzgs.config.files import (
     save_config,
     to_dict,
 )
-from blitzgs.config.ranges import RANGES, _entries, describe, describe_all, flat, problems
+from blitzgs.config.ranges import RANGES, describe, describe_all, flat, problems
 from blitzgs.config.schedule import Schedule
 from blitzgs.optim.table_adam import BETA1, BETA2, EPS
 from tests.helpers import refused
@@ -68,13 +67,9 @@ def test_saved_configuration_reads_back_to_the_same(tmp_path):
         ("--nonsense=3", "nonsense: unknown field; known: data, model"),
         ("--schedule.iterations=many", r"schedule.iterations: must be an integer, got 'many' \(str\)"),
         ("--schedule.iterations=25e-1", "schedule.iterations: must be an integer, got 2.5"),
-        ("--schedule.iterations=3.5", "schedule.iterations: must be an integer, got 3.5"),
         ("--schedule.batch_size=true", "schedule.batch_size: must be an integer, got True"),
-        ("--schedule.batch_size=33", r"schedule.batch_size: must be in \[1, 32\], got 33"),
         ("--loss.ssim=high", "loss.ssim: must be a number, got 'high'"),
         ("--loss.ssim=1.5", r"loss.ssim: must be in \[0, 1\], got 1.5"),
-        ("--optimiser.opacity=-0.01", r"optimiser.opacity: must be in \[0, 10\], got -0.01"),
-        ("--optimiser.sh_dc=.inf", r"optimiser.sh_dc: must be in \[0, 10\], got inf"),
         ("--model.background=[0, 0]", "model.background: must be a list of 3 values"),
         ("--loss=3", "loss: must be a section with ssim"),
         ("--log.tensorboard=1", "log.tensorboard: must be true or false, got 1"),
@@ -82,12 +77,12 @@ def test_saved_configuration_reads_back_to_the_same(tmp_path):
         ("--seed=[", "seed: cannot read the value"),
         ("--schedule.scale=" + "9" * 400, "schedule.scale: 9+ is too large"),
         ("--log=&all {every: *all}", "log: sections are nested more than 20 deep"),
-        ("--schedule.scale=1e-9", r"schedule.scale: must be in \[0.0001, 10,000\], got 1e-09"),
         ("--schedule.iterations=999999999", "times schedule.scale must be at most 10,000,000 images"),
         ("--view.lod=fade", "view.lod: must be true, false or smooth, got fade"),
         ("--lod.visible_threshold=1", r"lod.visible_threshold: must be in \[0, 1\), got 1.0"),
         ("--data.exif=maybe", "data.exif: must be one of auto, apply, ignore, got maybe"),
         ("--view.cull=true", "view.cull: needs population.importance=true"),
+        ("--population.importance=true --schedule.t1=9 --schedule.t2=9", "schedule.t2: the second pass"),
         ("--population.strategy=relocation --population.gate=a.json", "gate: .* relocation has none"),
         (
             "--loss.opacity=0.03 --loss.opacity_total=1",
@@ -104,11 +99,8 @@ def test_saved_configuration_reads_back_to_the_same(tmp_path):
         ("--schedule.resolution=[2, 100]", r"resolution\[0\]: must be a list of 2 values, got 2"),
         ("--schedule.pace=[[16, 1], [16, 2]]", r"schedule.pace: .* above 0 and increase, got \[16, 16\]"),
         ("--schedule.pace=[[16, 1e5]]", r"schedule.pace: its factors must be in .*, got 100000.0"),
-        ("--schedule.pace=[[0, 1]]", r"schedule.pace: must be in .*, got \(\(0, 1.0\),\)"),
-        ("--schedule.pace=[[16]]", r"schedule.pace\[0\]: must be a list of 2 values, got \[16\]"),
         ("--schedule.pace=[[1.5, 2]]", r"schedule.pace\[0\]\[0\]: must be an integer, got 1.5"),
         ("--schedule.pace=[[16, 9e3]]", r"times schedule.scale must be at most 10,000,000 images"),
-        ("--schedule.minutes=-1", r"schedule.minutes: must be in \[0, 1,000,000\], got -1.0"),
         ("--schedule.minutes=3 --schedule.scale=0.5", r"schedule.scale: must be 1 .*--minutes.* got 0.5"),
     ],
 )
@@ -122,22 +114,23 @@ def test_what_is_refused_beside_another_field_is_taken_alone():
     assert load_config(AERIAL, ["loss.opacity=0.03", "loss.opacity_total=0"]).loss.opacity == 0.03
 
 
-def test_an_error_of_a_file_names_the_file(tmp_path):
-    file = tmp_path / "mine.yaml"
-    for text, message in (
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
         ("loss:\n  sim: 1", "loss.sim: unknown field"),
         ("loss: 5", "loss: must be a section"),
-    ):
-        file.write_text(text)
-        refused(ConfigError, f"^{file}: {message}", load_config, file)
-
-
-def test_unreadable_files(tmp_path):
-    refused(ConfigError, "cannot read the configuration", load_config, tmp_path / "missing.yaml")
-    (tmp_path / "broken.yaml").write_text("a: [")
-    refused(ConfigError, "not valid YAML", load_config, tmp_path / "broken.yaml")
-    (tmp_path / "loop.yaml").write_text("base: loop.yaml")
-    refused(ConfigError, "leads back", load_config, tmp_path / "loop.yaml")
+        ("a: [", "not valid YAML"),
+        ("loss:\n  ssim: 0.5\nloss:\n  scale: 1", "not valid YAML: the key 'loss' is given twice"),
+        ("base: mine.yaml", "'base' leads back"),
+        ("base: smok", r"base: smok: no such file in .*did you mean 'smoke'\? recipes are"),
+        (None, "cannot read the configuration"),
+    ],
+)
+def test_an_error_of_a_file_names_the_file(tmp_path, content, message):
+    file = tmp_path / "mine.yaml"
+    if content is not None:
+        file.write_text(content)
+    refused(ConfigError, f"^{file}: {message}", load_config, file)
 
 
 NUMBERS = [
@@ -185,32 +178,21 @@ def test_a_position_rate_of_zero_keeps_the_means_in_place():
     assert rates.isfinite().all() and not rates[:, 0].any() and rates[1:, 1:].all()
 
 
-@pytest.mark.parametrize("name", ["100_0001", "0042", "2024-01-05", "1.50", "12:30"])
-def test_a_name_that_looks_like_a_number_or_a_date_is_kept(tmp_path, name):
-    assert load_config(None, [f"--data.images={name}"]).data.images == name
-    file = tmp_path / "c.yaml"
-    file.write_text(f"data:\n  images: {name}\n")
-    assert load_config(file).data.images == name
-
-
-def test_a_number_may_have_zeros_in_front_and_underscores():
-    numbers = ["--seed=9_223_372_036_854_775_807", "--log.every=010", "--model.near=1.5e-01"]
-    config = load_config(None, numbers)
-    assert (config.seed, config.log.every, config.model.near) == (2**63 - 1, 10, 0.15)
-
-
-def test_masks_may_be_switched_off():
-    assert load_config(None, ["--data.masks=false"]).data.masks is False
-    assert load_config(None, ["--data.masks=true"]).data.masks is True
-    assert load_config(None, ["--data.masks=folder"]).data.masks == "folder"
-
-
-def test_a_section_that_is_there_twice_is_refused_and_a_bom_is_not_read(tmp_path):
-    file = tmp_path / "config.yaml"
-    file.write_text("seed: 1\nloss:\n  ssim: 0.5\nloss:\n  scale: 1\n")
-    refused(ConfigError, "config.yaml: not valid YAML: the key 'loss' is given twice", load_config, file)
-    file.write_bytes(b"\xef\xbb\xbfseed: 7\n")
-    assert load_config(file).seed == 7
+@pytest.mark.parametrize(
+    ("name", "text", "value"),
+    [
+        *(("data.images", name, name) for name in ("100_0001", "0042", "2024-01-05", "1.50", "12:30")),
+        *(("data.masks", text, value) for text, value in (("false", False), ("true", True), ("a", "a"))),
+        ("seed", "9_223_372_036_854_775_807", 2**63 - 1),
+        ("log.every", "010", 10),
+        ("model.near", "1.5e-01", 0.15),
+    ],
+)
+def test_texts_are_read_by_the_kind_of_their_field(tmp_path, name, text, value):
+    file, content = tmp_path / "c.yaml", name.replace(".", ": {") + f": {text}" + "}" * name.count(".")
+    file.write_text(content, encoding="utf-8-sig")  # with a mark of its byte order
+    for config in (load_config(None, [f"--{name}={text}"]), load_config(file)):
+        assert flat(dataclasses.asdict(config))[name] == value
 
 
 VALUES = st.recursive(
@@ -266,11 +248,8 @@ def test_the_papers_configuration_has_the_papers_values():
     assert population.importance and population.phi
     assert (population.pass1_keep, population.pass2_mass, population.pass2_keep) == (0.7, 0.99, 1)
     assert population.gate_rate == 0.6
-    assert (population.max_gaussians, population.pixels_per_gaussian, population.min_observations) == (
-        0,
-        0,
-        1,
-    )
+    assert population.max_gaussians == population.pixels_per_gaussian == 0
+    assert population.min_observations == 1
     assert (loss.ssim, loss.scale) == (0.2, 10)
     assert not config.model.antialiased and config.model.sh_degree == 3
 
@@ -284,14 +263,6 @@ def test_a_base_may_be_a_recipe(tmp_path, base):
     # A file beside it has priority.
     (tmp_path / base).write_text("schedule: {batch_size: 9}\n")
     assert load_config(tmp_path / "mine.yaml").schedule.batch_size == 9
-
-
-def test_a_base_that_is_nowhere_names_the_recipes(tmp_path):
-    (tmp_path / "mine.yaml").write_text("base: smok\n")
-    with pytest.raises(
-        ConfigError, match=r"base: smok: no such file in .*did you mean 'smoke'\? recipes are"
-    ):
-        load_config(tmp_path / "mine.yaml")
 
 
 PAGE = Path(__file__).parents[2] / "docs" / "configuration.md"
@@ -310,19 +281,6 @@ def test_every_field_is_explained(name, explained):
     # The flag that is shown sets the default.
     assert load_config(None, [head.split("   (")[0]]) == Config()
     assert head in explained
-
-
-def test_no_field_that_is_gone_is_explained():
-    sections = ["", *{name.partition(".")[0] for name in FIELDS if "." in name}]
-    explained = [name for section in sections for names in _entries(section) for name in names]
-    assert sorted(explained) == sorted(FIELDS)
-
-
-@pytest.mark.parametrize(
-    ("wanted", "message"), [("downscal", "did you mean downscale"), ("data.zzz", "no such field")]
-)
-def test_an_unknown_field_is_named(wanted, message):
-    refused(ConfigError, message, describe, wanted)
 
 
 def test_the_page_of_the_configuration_is_up_to_date(capsys):
@@ -348,18 +306,21 @@ def test_every_recipe_has_a_name_and_can_be_loaded():
 
 
 @pytest.mark.parametrize(
-    ("device", "recipe"), [("cpu", "aerial_cpu"), ("cuda", "aerial"), ("cuda:1", "aerial")]
+    ("flags", "has_gpu", "recipe"),
+    [
+        (["--device", "cpu"], True, "aerial_cpu"),
+        (["--device", "cuda:1"], False, "aerial"),
+        ([], True, "aerial"),
+        ([], False, "aerial_cpu"),
+    ],
 )
-def test_a_run_without_a_configuration_gets_the_recipe_of_its_device(capsys, device, recipe):
-    config, said = shown(capsys, "--device", device)
+def test_a_run_without_a_configuration_gets_the_recipe_of_its_device(
+    capsys, monkeypatch, flags, has_gpu, recipe
+):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: has_gpu)
+    config, said = shown(capsys, *flags)
     assert config == to_dict(load_config(recipe_path(recipe)))
     assert f"recipe: {recipe} (choose another one with --config)" in said
-
-
-def test_the_recipe_follows_the_device_that_auto_finds(capsys, monkeypatch):
-    for has_gpu in (True, False):
-        monkeypatch.setattr(torch.cuda, "is_available", lambda has_gpu=has_gpu: has_gpu)
-        assert f"recipe: {default_recipe(has_gpu)} " in shown(capsys)[1]
 
 
 def test_names_files_and_the_defaults_of_fields(capsys, tmp_path):

@@ -18,7 +18,6 @@ import torch
 from torch.distributed import TCPStore
 
 from blitzgs.distributed.group import Ranks
-from tests.helpers import needs_cuda
 
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(["torch", "torch.distributed", "blitzgs.cli.train", "tests.training.tiny"])
@@ -71,7 +70,7 @@ def on_cuda(*world_sizes):
             size,
             "cuda",
             id=f"cuda-{size}-shared" if 0 < gpus < size else f"cuda-{size}",
-            marks=[pytest.mark.cuda, needs_cuda],
+            marks=pytest.mark.cuda,
         )
         for size in world_sizes
     ]

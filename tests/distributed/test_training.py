@@ -23,7 +23,6 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.runs import run_files, trained_model
 from blitzgs.training.events import densify
 from tests.distributed.rank_harness import EIGHT, all_fail, on_each_device, run_ranks
-from tests.helpers import needs_cuda
 from tests.training.tiny import (
     OVERRIDES,
     as_flags,
@@ -375,7 +374,6 @@ def test_a_resumed_run_is_the_same(whole, tmp_path):
 
 
 @pytest.mark.cuda
-@needs_cuda
 @pytest.mark.parametrize("name", OPTIONS)
 def test_cuda_trains_with_each_option_and_resumes_exactly(name, tmp_path):
     ranks, options = Ranks(device=torch.device("cuda")), (*OPTIONS[name], "model.deterministic=true")

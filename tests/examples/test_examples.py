@@ -17,7 +17,7 @@ from blitzgs._library import LIBRARY_DIR
 from blitzgs.capture.colmap import ColmapCamera, ColmapImages, ColmapModel, ColmapPoints, write_model
 from blitzgs.capture.pictures import save_image
 from blitzgs.formats.ply import read_ply
-from tests.helpers import DEVICES, orbit_camera
+from tests.helpers import orbit_camera
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENE = (
@@ -115,7 +115,6 @@ def example(name):
     return module
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_minimal_trainer_it_learns_a_capture(device, tmp_path, capsys):
     write_capture(tmp_path)
     out = tmp_path / "model.ply"

@@ -4,6 +4,7 @@
 import json
 import math
 import resource
+import warnings
 
 import numpy as np
 import plyfile
@@ -111,9 +112,14 @@ def test_comments_and_normals_survive_the_round_trip(tmp_path):
 def test_offset_is_added_in_float64(tmp_path):
     columns = gaussians(4, 0)
     offset = np.array([123456.789, -2.0, 0.1])
-    write_ply(tmp_path / "a.ply", **columns, offset=offset)
+    columns["scales"][:] = 0
+    with warnings.catch_warnings(action="error"):
+        write_ply(tmp_path / "a.ply", **columns, offset=offset)
     expected = (columns["means"].double().numpy() + offset).astype(np.float32)
     np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").means.numpy(), expected)
+    columns["scales"][:] = -3
+    with pytest.warns(UserWarning, match=r"rounds positions by up to 0.00391: .*comment offset X Y Z"):
+        write_ply(tmp_path / "a.ply", **columns, offset=offset)
 
 
 def test_other_orders_missing_normals_ascii_and_big_endian_are_read(tmp_path):
@@ -299,10 +305,12 @@ def test_polygons_of_files(tmp_path):
         "# region\n0 0\n2, 0\n\n1 5\n",
         json.dumps(polygon),
         json.dumps({"type": "FeatureCollection", "features": [{"geometry": polygon}]}),
+        "\ufeff" + json.dumps(polygon),
     ):
         path.write_text(text)
         np.testing.assert_array_equal(read_polygon(path), ring)
     bad = ("0 0\n1 1\n", "0 0\nx y\n1 1\n", "0 0\n1 1\nnan 2\n", "{", '{"type": "Point"}', "0 0 0\n" * 4)
-    for text in bad:
+    two = json.dumps({"type": "FeatureCollection", "features": [{"geometry": polygon}] * 2})
+    for text in (*bad, two):
         path.write_text(text)
         refused(ValueError, "region cannot be read as a polygon", read_polygon, path)

@@ -414,3 +414,7 @@ def test_any_number_of_cells_is_kept_and_invisible_gaussians_are_merged():
     one_place = model.means.clone()
     model.means[:] = one_place[0]
     assert len(merged(moments(model), 300, BOX, True)[0]) == 1
+    # Lengths whose squares float32 does not hold.
+    model.means[1], model.scales[2] = 1e30, 60.0
+    for rows in (moments(model), merged(moments(model), 7, BOX, True)[0]):
+        shown(rows, []).check()

@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from blitzgs.formats import gaussians as blocks
 from blitzgs.formats import glb
-from blitzgs.formats.gaussians import Gaussians
 from blitzgs.formats.glb import write_glb
 from blitzgs.formats.streamed_sog import write_streamed_sog
 from blitzgs.formats.web_page import (
@@ -177,16 +176,6 @@ def test_what_no_viewer_could_show_is_refused(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
     path.write_bytes(b"ply\n")
     refused(FileExistsError, "not a GLB file", write_glb, path, some_gaussians(3, 0))
-
-
-def test_a_zero_quaternion_is_no_rotation(tmp_path):
-    model = some_gaussians(2, 0)
-    model.quats[0] = 0
-    assert isinstance(model, Gaussians)
-    write_glb(tmp_path / "a.glb", model)
-    np.testing.assert_array_equal(
-        read_glb(tmp_path / "a.glb")[1]["KHR_gaussian_splatting:ROTATION"][0], [0, 0, 0, 1]
-    )
 
 
 def leaves(node):

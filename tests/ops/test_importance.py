@@ -16,7 +16,7 @@ from blitzgs.reference.render import contributions as by_definition
 from blitzgs.reference.render import top_mass
 from blitzgs.spawn.candidates import FEATURES, spawn_features
 from blitzgs.table.table import GaussianTable
-from tests.helpers import BACKENDS, DEVICES, random_scene, refused
+from tests.helpers import random_scene, refused
 from tests.population.test_density import LEVELS, random_table
 
 
@@ -45,7 +45,6 @@ def crowded(device="cpu", dtype=torch.float32):
 
 
 @pytest.mark.parametrize("tile_size", [8, 16, 32])
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_sees_what_the_renderer_composites_bit_for_bit(backend, tile_size):
     if backend[0] == "cuda" and tile_size != 16:
         pytest.skip("CUDA composites tiles of 16 pixels")
@@ -68,7 +67,6 @@ def test_sees_what_the_renderer_composites_bit_for_bit(backend, tile_size):
     assert torch.equal(without[0], weights) and torch.equal(without[1], pixels) and not len(without[2])
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_parts_add_up_and_repeat(backend):
     splats, lists, grid = lists_of(crowded(*backend))
     sums = splat_contributions(splats, lists, grid, squares=True)
@@ -93,7 +91,6 @@ def test_opcheck(squares):
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_contributions_equal_the_definition(backend, mode):
     # These are more views than one call takes.
     scene = random_scene(70, 10, seed=5, scale=0.15).to(backend[1], backend[0])
@@ -208,7 +205,6 @@ def items(kind, n_segments, seed=0):
     return weights, segments.int(), owners.int(), ids
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("n_segments", [1, 3, 11])
 @pytest.mark.parametrize("kind", ["many sizes", "ties", "all alike", "tiny", "zeros"])
 @pytest.mark.parametrize("share", [(0, 1), (1, 2), (99, 100), (123_456_789, 1_000_000_000), (1, 1)])
@@ -221,7 +217,6 @@ def test_mass_cuts_equal_sorting(device, n_segments, kind, share):
     assert not cut.sums.any()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_largest_weights(device):
     weights = torch.tensor([(1 << 61) - 1, 1 << 60, (1 << 60) - 1, 1, 0])
     ids = torch.tensor([4, 0, 3, 2, 1])
@@ -232,7 +227,6 @@ def test_largest_weights(device):
         assert cut.chosen.tolist() == by_sorting(weights.tolist(), [0] * 5, ids.tolist(), share)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("kind", ["many sizes", "ties", "zeros"])
 def test_sums_of_parts_add_up(device, kind):
     """Three ranks, the last without items, add up their sums after every scan."""
@@ -315,7 +309,6 @@ def expected(table, rows, is_split):
     return torch.stack([columns[name] for name in FEATURES], 1)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("count", [1, 1000])
 def test_spawn_features_match_the_formulas(device, count):
     table, rows, is_split = candidates(count, device)

@@ -6,7 +6,7 @@ import torch
 
 from blitzgs.ops.intersect import intersect, tile_counts
 from blitzgs.ops.splat_gradients import SPLAT_GRADIENT
-from tests.helpers import DEVICES, needs_cuda, on_threads, refused
+from tests.helpers import on_threads, refused
 from tests.ops.splats import Splats, kept_by, pixel_alphas, random_splats, with_capacity
 
 WIDTH, HEIGHT = 91, 70
@@ -124,7 +124,6 @@ def test_does_not_depend_on_threads():
     assert all(torch.equal(a, b) for r in results[1:] for a, b in zip(results[0], r, strict=True))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_capacity(device):
     splats = Splats(*(t.to(device) for t in vars(random_splats(100, WIDTH, HEIGHT)).values()))
     entries, offsets = intersect(*splats.geometry(), **GRID)
@@ -209,7 +208,6 @@ def empty_room(device, number):
     return Columns(0, 500, device).padded, torch.tensor([number], device=device)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("with_ids", [False, True])
 @pytest.mark.parametrize("n", [0, 1, 1024, 8192, 20_000])
 def test_lists_ignore_entries_after_the_last_splat(n, with_ids, device):
@@ -226,7 +224,6 @@ def test_lists_ignore_entries_after_the_last_splat(n, with_ids, device):
         assert torch.equal(found[: len(expected)], expected)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("number", [0, -1, 501, 2**62, -(2**63)])
 def test_a_number_out_of_range_is_no_splat(number, device):
     splats, count = empty_room(device, number)
@@ -239,7 +236,6 @@ def test_a_number_out_of_range_is_no_splat(number, device):
     assert (image[1] == 1).all() and not image[2].any() and not image[3].any()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_columns_with_zero_capacity(device):
     columns = Columns(0, 0, device)
     lists = ops.intersect(*columns.padded.geometry(), None, *VIEW, 0, -1, 10, columns.count)
@@ -250,7 +246,6 @@ def test_columns_with_zero_capacity(device):
     assert not renders.any()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(
     ("channels", "composited", "owned"),
     [(3, (0, -1), (0, -1)), (3, (2, 25), (7, 20)), (3, (0, -1), (4, 30)), (9, (0, -1), (0, -1)),
@@ -280,7 +275,6 @@ def test_images_and_gradients_ignore_entries_after_the_last_splat(n, channels, c
         assert torch.equal(found, expected)
 
 
-@needs_cuda
 @pytest.mark.cuda
 @pytest.mark.parametrize("tiles", [(0, -1), (3, 9)])
 @pytest.mark.parametrize(("n", "capacity"), [(700, 1500), (0, 900), (50_000, 60_000)])
@@ -304,7 +298,6 @@ def test_a_table_of_gradients_is_zeroed_for_the_splats(n, capacity, tiles):
     assert memory[:40].isnan().all() and memory[40 + capacity :].isnan().all()
 
 
-@needs_cuda
 @pytest.mark.cuda
 @pytest.mark.parametrize("share", [0.999, 0.5, 0.1, 0.0])
 @pytest.mark.parametrize("tiles", [(0, -1), (5, 40)])
@@ -324,7 +317,6 @@ def test_lists_with_too_little_room_are_the_nearest_splats(share, tiles):
         assert len(found) <= offsets[tile + 1] - offsets[tile]
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_lists_with_too_little_room_are_an_error(device):
     columns = Columns(100, 150, device)
     count = len(ops.intersect(*columns.alone.geometry(), None, *VIEW, 0, -1, -1)[0])
@@ -332,7 +324,6 @@ def test_lists_with_too_little_room_are_an_error(device):
         ops.intersect(*columns.padded.geometry(), None, *VIEW, 0, -1, count - 1, columns.count)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_errors_name_the_value_of_splat_count(device):
     columns = Columns(100, 150, device)
     with pytest.raises(RuntimeError, match="n_splats must be Long, got Int"):
@@ -353,7 +344,6 @@ def test_errors_name_the_value_of_splat_count(device):
             )  # fmt: skip
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_opcheck(device):
     columns = Columns(20, 30, device)
     alone, padded = ((*s.geometry(), None, *VIEW, 0, -1) for s in (columns.alone, columns.padded))

@@ -11,7 +11,7 @@ from blitzgs.ops.lazy_adam import (
     lazy_adam_catch_up_,
     lazy_adam_step_,
 )
-from tests.helpers import DEVICES, needs_cuda, refused
+from tests.helpers import refused
 
 COEFFICIENTS = 4
 BETA1, BETA2, EPS = 0.9**2, 0.999**2, 1e-15 / math.sqrt(2)
@@ -187,7 +187,6 @@ def drift_one_by_one(state, lr_table, begin, end):
     return drifts
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("begin", [1, 30, 150, 400, 2000])
 @pytest.mark.parametrize("gap", [1, 2, 40, 700])
 def test_float32_drift_of_any_second_moment(begin, gap, device):
@@ -274,7 +273,6 @@ def test_a_schedule_of_another_dtype_is_refused():
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_catching_up_needs_no_more_memory_late_in_a_schedule():
     schedule = schedule_of(100_000, torch.float32, "cuda")
     peaks = []
@@ -349,7 +347,6 @@ def test_opcheck():
 
 
 @pytest.mark.cuda
-@needs_cuda
 @pytest.mark.parametrize("k", [1, 4, 9, 16])
 def test_cuda_equals_cpu(k):
     schedules = {device: schedule_of(300, torch.float32, device) for device in ("cpu", "cuda")}
@@ -368,7 +365,6 @@ def test_cuda_equals_cpu(k):
 
 
 @pytest.mark.cuda
-@needs_cuda
 @pytest.mark.parametrize("column", [1, 4])
 def test_cuda_refuses_what_begins_within_16_bytes(column):
     state = new_state(8, torch.float32, "cuda", k=16)

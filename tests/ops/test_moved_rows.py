@@ -29,7 +29,7 @@ from blitzgs.ops.projection_types import Views
 from blitzgs.table.blocks import BlockIndex
 from blitzgs.table.placement import place
 from blitzgs.table.table import CULL, sectors_in
-from tests.helpers import DEVICES, refused
+from tests.helpers import refused
 from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views
 from tests.table.test_table import append
 from tests.training.tiny import random_gaussians
@@ -41,7 +41,6 @@ COLUMNS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(("count", "taken"), [(700, 600), (257, 257), (9, 0)])
 def test_equals_torch_s_indexing(device, count, taken):
     g = torch.Generator().manual_seed(count)
@@ -68,7 +67,6 @@ def test_equals_torch_s_indexing(device, count, taken):
             assert torch.equal(changed[i], column)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_bits_and_unaligned_columns(device):
     numbers = torch.arange(4 * 21, dtype=torch.int32, device=device)
     numbers[::5] = 0x7FC12345  # a NaN with a payload, as float32
@@ -109,7 +107,6 @@ def random_rows(n, words, device="cpu"):
     return torch.randint(-(2**31), 2**31, (n, words), generator=generator).int().to(device)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("words", [0, 1, 3, 40])
 @pytest.mark.parametrize("n", [0, 1, 31, 256, 257, 5000])
 def test_every_bit_is_at_its_place_and_comes_back(n, words, device):
@@ -126,7 +123,6 @@ def test_every_bit_is_at_its_place_and_comes_back(n, words, device):
     assert torch.equal(rows_of_sectors(sectors, n), rows)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("n", [300, 1024])
 def test_a_table_s_mask_moves_with_its_rows(n, device):
     """The table also has an ordinary column with the same numbers."""
@@ -180,7 +176,6 @@ def test_errors_name_the_value_of_cull_mask():
         rows_of_sectors(torch.zeros(1, 31, 8, dtype=torch.int32), 200)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_opcheck_of_cull_mask(device):
     rows = random_rows(300, 2, device)
     torch.library.opcheck(torch.ops.blitzgs.sectors_of_rows, (rows,))
@@ -195,7 +190,6 @@ def sizes_of(count, device):
     return torch.tensor([[WIDTH, HEIGHT]] * count, dtype=torch.int32, device=device)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("seed", range(3))
 def test_blocks_that_no_view_sees_have_no_active_rows(device, seed):
     table = make_table(60_000, device, seed)
@@ -210,7 +204,6 @@ def test_blocks_that_no_view_sees_have_no_active_rows(device, seed):
     assert (seen == 0).any()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_views_have_sizes_of_their_own(device):
     table = make_table(20_000, device)
     viewmats, Ks = make_views(2, device)
@@ -232,7 +225,6 @@ def columns(rows, device, pinned=False, seed=0):
     return [column.pin_memory() if pinned else column.to(device) for column in made]
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_swapped_blocks_have_the_right_contents(device):
     blocks, slots, rest = 40, 12, 100
     pool = columns(slots * BLOCK_ROWS + 7, device, seed=1)
@@ -312,7 +304,6 @@ def test_memory_of_a_copy_that_is_not_read_is_kept_until_it_is_written(monkeypat
     assert [found() is not None for found in memory] == [True, False, True]
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_keys_match_the_formula(device):
     g = torch.Generator().manual_seed(1)
     weights = torch.rand(3000, generator=g) * 1e9
@@ -324,7 +315,6 @@ def test_keys_match_the_formula(device):
     assert keys[::7].isinf().all()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("count", [0, 700, 100_000])
 def test_digits_of_keys_are_counted_under_a_prefix(device, count):
     g = torch.Generator().manual_seed(count)
@@ -347,7 +337,6 @@ def test_digits_of_keys_are_counted_under_a_prefix(device, count):
         assert torch.equal(second.cpu(), torch.bincount(under >> shift - 10 & 1023, minlength=1024))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("width", [0, 5, 9, 11, 13])
 def test_a_search_takes_the_digit_that_its_number_lies_in(device, width):
     counts = torch.randint(3, (1 << width,), generator=torch.Generator().manual_seed(width))

@@ -10,7 +10,7 @@ from blitzgs.ops.photometric import (
     pixel_counts,
     ssim,
 )
-from tests.helpers import DEVICES, on_threads, refused, ssim_map, sum_parts
+from tests.helpers import on_threads, refused, ssim_map, sum_parts
 
 
 def reference_sums(x, y, masks=None):
@@ -44,7 +44,6 @@ def sums_and_gradient(*arguments):
     return *sum_parts(parts), v_renders
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("shape", [(2, 53, 70), (1, 1, 1), (3, 7, 200), (1, 130, 3), (1, 200, 400)])
 def test_float32_matches_the_definition(device, masked, shape):
@@ -65,7 +64,6 @@ def test_float32_matches_the_definition(device, masked, shape):
     assert torch.equal(bwd, v_renders)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("tiles", [(0, -1), (3, 9), (4, 4)])
 def test_weights_are_divided_by_samples_and_visible_gaussians(device, tiles):
     x, targets, masks = images(device=device)
@@ -98,11 +96,9 @@ def test_gradcheck(masked):
     y = targets.double() / 255 + 0.003  # off the kink of |x - y|
     arguments = (y, masks if masked else None)
     assert torch.autograd.gradcheck(lambda r: photometric_sums(r, *arguments), (x.requires_grad_(),))
-    assert torch.autograd.gradcheck(lambda r: photometric_sums(r, *arguments, 4, 5, 14)[1].sum() * 0
-                                    + photometric_loss(r, *arguments), (x,))  # fmt: skip
+    assert torch.autograd.gradcheck(lambda r: photometric_loss(r, *arguments), (x,))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("tile_size", [16, 7])
 def test_a_partition_of_the_tiles_adds_up_to_the_whole(device, tile_size):
     x, targets, masks = images((3, 75, 61), device=device)
@@ -135,7 +131,6 @@ def test_a_partition_of_the_tiles_adds_up_to_the_whole(device, tile_size):
     torch.testing.assert_close(ssims, whole[1], rtol=1e-6, atol=0)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_loss_and_ssim_are_means(device):
     x, targets, masks = images(device=device)
     l1, ssims = reference_sums(x, targets.double() / 255, masks)
@@ -149,7 +144,6 @@ def test_loss_and_ssim_are_means(device):
     assert photometric_loss(x, targets, torch.zeros_like(masks)).tolist() == [0.0, 0.0]
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_equal_images_have_ssim_one_and_no_gradient(device):
     y = images(device=device)[1]
     x = (y.float() * (1 / 255)).requires_grad_()
@@ -165,14 +159,12 @@ def test_threads_do_not_change_the_result():
     assert all(torch.equal(a, b) for a, b in zip(one, three, strict=True))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_empty_batch(device):
     x = torch.zeros(0, 8, 8, 3, device=device)
     outputs = photometric_fwd_bwd(x, x, None, x.new_zeros(0), x.new_zeros(0))
     assert [tuple(t.shape) for t in outputs] == [(0, 0, 2), (0, 8, 8, 3), (0,), (0,)]
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("size", [(0, 8), (8, 0)])
 def test_images_without_pixels_have_no_weights(device, size):
     x, weights = torch.zeros(2, *size, 3, device=device), torch.ones(2, device=device)
@@ -187,10 +179,11 @@ def test_images_without_pixels_have_no_weights(device, size):
 def test_errors_name_the_value():
     x, targets, _ = images()
     refused(RuntimeError, r"targets .* \[2, 53, 70, 3\], got \[1, 5", photometric_sums, x, targets[:1])
-    refused(RuntimeError, r"of the 40 tiles, got \[3, 41\)", photometric_sums, x, targets, None, 16, 3, 41)
     refused(RuntimeError, "masks must .* got Float", photometric_sums, x, targets, torch.ones(2, 53, 70))
     refused(RuntimeError, r"\(if not uint8\) .*, got Double", photometric_sums, x, targets.double())
     weights = torch.ones(2)
+    arguments = (x, targets, None, weights, weights, 16, 3, 41)
+    refused(RuntimeError, r"of the 40 tiles, got \[3, 41\)", photometric_fwd_bwd, *arguments)
     with pytest.raises(RuntimeError, match=r"samples must have shape \[2\], got \[3\]"):
         photometric_fwd_bwd(x, targets, None, weights, weights, samples=torch.ones(3))
     with pytest.raises(RuntimeError, match="samples must be Float, got Long"):
@@ -199,7 +192,6 @@ def test_errors_name_the_value():
         photometric_fwd_bwd(x, targets, None, weights, weights, visible=torch.ones(2).int())
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_opcheck(device):
     x, targets, masks = images((1, 12, 9), device=device)
     weights = torch.ones(1, device=device)

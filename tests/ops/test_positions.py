@@ -13,7 +13,7 @@ from blitzgs.ops.counter_random import hash_keys, normal, uniform
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.population import position_noise_, voxel_keys
 from blitzgs.population.density import rotations
-from tests.helpers import DEVICES, refused
+from tests.helpers import refused
 
 
 def cloud(kind, n=3000):
@@ -31,7 +31,6 @@ def cloud(kind, n=3000):
     return points
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("k", [1, 3, 6, 32])
 @pytest.mark.parametrize("kind", ["uniform", "clusters and outliers", "plane", "duplicates"])
 def test_knn_distances_match_a_kd_tree(device, k, kind):
@@ -49,7 +48,6 @@ def test_knn_distances_in_float64_are_exact():
         torch.testing.assert_close(found, torch.from_numpy(expected), rtol=1e-14, atol=0)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_rows_that_are_not_finite_are_left_out(device):
     points = torch.from_numpy(cloud("uniform", 200)).float()
     points[7, 1], points[50] = math.nan, math.inf
@@ -61,7 +59,6 @@ def test_rows_that_are_not_finite_are_left_out(device):
     assert knn_distances(torch.full((9, 3), math.nan, device=device), 2).isinf().all()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_knn_distances_of_small_clouds(device):
     points = torch.tensor([[0.0, 0, 0], [3, 4, 0], [0, 0, 1]], device=device)
     assert knn_distances(points, 4)[0].tolist() == [1.0, 5.0, math.inf, math.inf]
@@ -69,7 +66,6 @@ def test_knn_distances_of_small_clouds(device):
     assert knn_distances(points[:0], 2).shape == (0, 2)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_hundred_thousand_equal_points(device):
     """Linear time even when every point is the same."""
     got = knn_distances(torch.full((100_000, 3), 0.7, device=device), 3)
@@ -81,12 +77,10 @@ def test_knn_distances_errors_name_the_value():
     refused(RuntimeError, r"points .* shape \[\*, 3\], got \[4, 2\]", knn_distances, torch.zeros(4, 2), 3)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_knn_distances_opcheck(device):
     torch.library.opcheck(torch.ops.blitzgs.knn_distances, (torch.randn(20, 3, device=device), 3))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_voxel_keys_matches_the_formula(device, dtype):
     points = torch.randn(1000, 3, dtype=dtype, generator=torch.Generator().manual_seed(0))
@@ -128,7 +122,6 @@ def expected(rows: dict[str, torch.Tensor], visible: torch.Tensor) -> torch.Tens
     return means
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_position_noise_matches_the_formula(device):
     rows = gaussians()
     visible = torch.arange(0, 300, 2, dtype=torch.int32)

@@ -14,7 +14,7 @@ from blitzgs.ops.lazy_adam import (
 from blitzgs.ops.project import project
 from blitzgs.ops.projection_types import ProjectionOptions, WeightedViews
 from blitzgs.ops.splat_gradients import SplatGradients
-from tests.helpers import BACKENDS, DEVICES, needs_cuda, refused
+from tests.helpers import refused
 
 BETA1, BETA2, EPS = 0.9**2, 0.999**2, 1e-15 / math.sqrt(2)
 STEP, WIDTH, HEIGHT, EPS2D = 70, 90, 60, 0.3
@@ -105,7 +105,6 @@ def compare(a, b, exact):
             torch.testing.assert_close(x, y, rtol=1e-5, atol=2e-6 * float(y.abs().max()))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(
     "n,k,degree,views",
     [
@@ -129,7 +128,6 @@ def test_equals_backward_and_step(device, n, k, degree, views):
         assert torch.equal(x[untouched], y[untouched])
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("width", [10, 12])
 @pytest.mark.parametrize(
     "n,k,degree,views", [(1, 16, 3, 1), (3000, 16, 3, 3), (700, 16, 2, 1), (700, 4, 1, 2), (700, 16, 0, 1)]
@@ -146,7 +144,6 @@ def test_gradients_are_read_where_they_are(device, width, n, k, degree, views):
     compare(plain, other, device == "cpu")
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_repeats_bit_for_bit(device):
     scenes = [Scene(5000, 16, 2, device) for _ in range(2)]
     for scene in scenes:
@@ -177,7 +174,6 @@ def test_errors_name_the_value():
     refused(RuntimeError, r"the moments of sh must have its shape \[20, 16, 3\]", scene.at_once)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_regularisers_have_the_gradients_of_their_definitions(backend):
     """Regularisers alone, without gradients of splats, agree with autograd in float64."""
     scene, scale = Scene(800, 16, 3, *backend, antialiased=True), 1.0 if backend[1] == torch.float32 else 1e-8
@@ -216,7 +212,6 @@ def test_errors_name_what_is_wrong_with_tables():
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_errors_name_what_does_not_fit():
     scene = Scene(20, 16, 1, "cuda")
     table = torch.zeros(len(scene.splats.means2d), 12, device="cuda")

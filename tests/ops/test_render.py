@@ -12,7 +12,7 @@ from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Sizes, splats_of
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.reference.render import composited_weights, median_splats, strongest_splats
-from tests.helpers import BACKENDS, DEVICES, needs_cuda, random_scene, refused
+from tests.helpers import random_scene, refused
 from tests.ops.test_importance import crowded, lists_of
 
 
@@ -54,7 +54,6 @@ def require_equal(found, expected):
             assert torch.equal(getattr(found, name), column), name
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("cameras", [1, 4])
 @pytest.mark.parametrize("degree", [None, 0, 1, 2, 3])
 @pytest.mark.parametrize("lengths", [(16,), (1, 15)])
@@ -73,7 +72,6 @@ def test_splats_are_those_of_a_projection_with_sh(backend, cameras, degree, leng
         assert torch.equal(own.nan_to_num(), gathered.nan_to_num()) and own.is_contiguous()
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("with_depth", [False, True])
 def test_images_are_those_of_lists_and_compositing(backend, with_depth):
     tables, sh = tables_of(*backend)
@@ -89,7 +87,6 @@ def test_images_are_those_of_lists_and_compositing(backend, with_depth):
 
 
 @pytest.mark.cuda
-@needs_cuda
 @pytest.mark.parametrize("cameras", [1, 4])
 @pytest.mark.parametrize("spare", [0, 1, 5000])
 def test_spare_capacity_changes_nothing(cameras, spare):
@@ -105,7 +102,6 @@ def test_spare_capacity_changes_nothing(cameras, spare):
 
 
 @pytest.mark.cuda
-@needs_cuda
 @pytest.mark.parametrize("missing", [(1, 0), (0, 1), (10, 10)])
 def test_too_little_capacity_writes_nothing_beyond_it(missing):
     tables, sh = tables_of("cuda")
@@ -133,7 +129,6 @@ def weights_of(splats, lists, grid):
     return rasterize(*splats, channels, *lists, **grid)[0].movedim(-1, 0)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("strongest", [0, 1, 3, 200])
 def test_equal_the_image_bit_for_bit(backend, strongest):
     scene = crowded(*backend)
@@ -155,7 +150,6 @@ def test_equal_the_image_bit_for_bit(backend, strongest):
     assert torch.equal(found.weights.sort(dim=1, descending=True).values, best)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_agree_with_the_definition(backend):
     scene = crowded(*backend)
     splats, lists, grid = lists_of(scene)
@@ -188,7 +182,6 @@ def test_agree_with_the_definition(backend):
         assert error[sure].abs().max() < (1e-9 if backend[1] == torch.float64 else 1e-4)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_of_equal_weights_the_front_ones_stay_in_their_order(device):
     """Ten splats whose opacities give all the same weight, but for one."""
     opacities = [1 / (20 - i) for i in range(10)]
@@ -205,7 +198,6 @@ def test_of_equal_weights_the_front_ones_stay_in_their_order(device):
         assert torch.equal(some.weights[3], weights[expected.to(device)])
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_list_of_pixels_has_their_rows_in_its_order(device):
     splats, lists, grid = lists_of(crowded(device))
     whole = pixel_splats(*splats, *lists, **grid, strongest=5)
@@ -217,7 +209,6 @@ def test_a_list_of_pixels_has_their_rows_in_its_order(device):
     assert [len(column) for column in none] == [0] * 5
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_nothing_to_composite(device):
     empty = [torch.zeros(0, *shape, device=device) for shape in ((2,), (3,), ())]
     lists = torch.zeros(0, dtype=torch.int32, device=device), torch.zeros(5, dtype=torch.int64, device=device)

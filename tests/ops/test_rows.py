@@ -8,7 +8,7 @@ from blitzgs.call.layout import Places
 from blitzgs.ops.derivatives import KeptMarks, distinct_rows, sparse_rows
 from blitzgs.ops.exchange import PLACE_SPLATS, gather_splats, scatter_splats
 from blitzgs.ops.projection_types import first_rows
-from tests.helpers import BACKENDS, DEVICES, refused
+from tests.helpers import refused
 
 COLUMNS = [((2,), torch.float32), ((3,), torch.float64), ((), torch.int64), ((), torch.float32)]
 
@@ -23,7 +23,6 @@ def places_of(device, ordered, scenes=2, views=3, gaussians=301, splats=700):
     return Places(index, (scenes, views, gaussians))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("ordered", [True, False])
 @pytest.mark.parametrize("splats", [700, 1, 0])
 def test_columns_are_at_their_places_and_come_back(device, ordered, splats):
@@ -42,7 +41,6 @@ def test_columns_are_at_their_places_and_come_back(device, ordered, splats):
     assert all(map(torch.equal, places.gather(strided), columns))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("ordered", [True, False])
 def test_columns_of_a_table_and_repeated_rows(device, ordered):
     places = places_of(device, ordered)
@@ -52,7 +50,6 @@ def test_columns_of_a_table_and_repeated_rows(device, ordered):
     assert all(map(torch.equal, places.arrange(columns), places.arrange(copies)))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_entries_without_a_splat_have_the_values_of_their_gaussians(device):
     places = places_of(device, ordered=False)
     under, column = torch.randn(2, 301, device=device), torch.randn(700, device=device)
@@ -101,7 +98,6 @@ def test_arrange_splats_opcheck():
     torch.library.opcheck(torch.ops.blitzgs.splats_of_arranged, (arranged, *arguments[1:]))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_first_rows_share_their_memory(device):
     columns = [torch.randn(9, 3, device=device), torch.arange(12, device=device)[3:]]
     for found, column, count in zip(first_rows(columns, [4, 20]), columns, [4, 20], strict=True):
@@ -126,7 +122,6 @@ class Rows(torch.autograd.Function):
         return sparse_rows(ctx.ids, v_rows, ctx.shape), None
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("dtype", [torch.int32, torch.int64])
 def test_a_gradient_that_autograd_hands_on_is_not_sorted(device, dtype):
     table, marks = torch.randn(9, 3, device=device, requires_grad=True), KeptMarks()
@@ -139,7 +134,6 @@ def test_a_gradient_that_autograd_hands_on_is_not_sorted(device, dtype):
     assert torch.equal(values, torch.arange(3.0, device=device).expand(3, 3))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_sums_of_gradients_are_summed(device):
     table = torch.zeros(9, 3, device=device, requires_grad=True)
     for ids in ([1, 4, 7], [4, 8]):
@@ -180,7 +174,6 @@ def on(device, tensors):
     return [tensor.to(device) for tensor in tensors]
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("n", [0, 1, 5, 6000])
 def test_splats_reach_their_groups(n, device):
     data, (masks, sizes) = columns(n), destinations(n)
@@ -199,7 +192,6 @@ def test_splats_reach_their_groups(n, device):
         assert torch.equal(got.cpu(), column[splats])
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("n", [0, 1, 5000])
 @pytest.mark.parametrize("widths", [[2, 0, 17, 1], [12]])  # 12: on CUDA read by whole rows, as from peers
 def test_sums_follow_the_splats_back(n, widths, device):
@@ -255,7 +247,6 @@ def test_scatter_opcheck():
 find_non_finite = torch.ops.blitzgs.find_non_finite
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
 def test_each_value_of_each_column_is_looked_at(backend, value):
     device, dtype = backend

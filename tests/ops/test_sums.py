@@ -9,7 +9,7 @@ import torch
 from blitzgs.ops.importance import DIVISIONS, ViewSums, view_sums_
 from blitzgs.ops.photometric import report_
 from blitzgs.ops.population import density_stats_, tree_sums
-from tests.helpers import DEVICES, refused, sum_parts
+from tests.helpers import refused, sum_parts
 
 DEPTH, FEATURES, TREES = 5, 3, 9
 
@@ -43,7 +43,6 @@ def tensors(nodes, roots):
     return torch.tensor(roots, dtype=torch.int32), torch.cat((bits[:, None], rest), 1), leaves, DEPTH
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("count", [0, 1, 700])
 def test_tree_sums_equal_a_walk_down_each_tree(device, count):
     nodes, roots = forest()
@@ -112,7 +111,6 @@ def add(sums, device, rule="density", columns=COLUMNS, seed=0):
     view_sums_(sums, tuple(t.to(device) for t in splats), *moved, columns, rule=rule, eps=EPS, unit=UNIT)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("rule", DIVISIONS)
 def test_view_sums_equal_dense_sums(device, rule):
     sums = empty(device)
@@ -172,7 +170,6 @@ def state(n=50, dtype=torch.float32, device="cpu"):
     return zeros, torch.zeros(n, dtype=torch.int32, device=device), zeros.clone()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("with_phi", [False, True])
 def test_density_stats_match_the_definition(device, with_phi):
     visible, offsets, gradients, conics, phi, covariance = rows(device=device)
@@ -196,7 +193,6 @@ def test_density_stats_match_the_definition(device, with_phi):
     assert off.max() <= 1 and (off == 0).float().mean() > 0.9  # a radius on an integer may round either way
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_radii_keep_their_maximum_and_empty_steps_change_nothing(device):
     visible, offsets, gradients, conics, _, _ = rows(device=device)
     sums, counts, radii = state(device=device)
@@ -210,7 +206,6 @@ def test_radii_keep_their_maximum_and_empty_steps_change_nothing(device):
     assert torch.equal(sums, before)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_gradients_are_read_where_they_are(device):
     """The gradients may be the first columns of a table."""
     visible, offsets, gradients, conics, _, _ = rows(device=device)
@@ -234,7 +229,6 @@ def test_density_stats_errors_name_the_value():
         density_stats_(sums, counts, radii, visible, offsets[1:], gradients, conics, WIDTH, HEIGHT, 1.0)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_density_stats_opcheck(device):
     visible, offsets, gradients, conics, phi, _ = rows(device=device)
     torch.library.opcheck(
@@ -243,7 +237,6 @@ def test_density_stats_opcheck(device):
     )
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("n_parts", [0, 1, 3000])
 def test_each_target_of_a_report_gets_this_ranks_share(device, n_parts):
     g = torch.Generator().manual_seed(1)
@@ -259,7 +252,6 @@ def test_each_target_of_a_report_gets_this_ranks_share(device, n_parts):
     assert torch.equal(torch.cat(sum_parts(parts)), targets[0][12:18])
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_report_of_tiles_alone_and_of_nothing(device):
     work = torch.arange(5, dtype=torch.int32, device=device)
     target = torch.zeros(5, device=device)

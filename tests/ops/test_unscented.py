@@ -12,7 +12,7 @@ from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
 from blitzgs.ops.unscented import GLOBAL_SHUTTER, Lenses, largest_angles, project_unscented
 from blitzgs.reference.projection import View, lens_pixels, sh_colors, unscented_splats
-from tests.helpers import BACKENDS, random_scene, refused, relative_error
+from tests.helpers import random_scene, refused, relative_error
 
 BROWN = (-0.1, 0.02, 0.003, 0.01, 0.02, 0.001, 0.003, -0.004, 0.001, 0.002, -0.002, 0.003)
 FISHEYE = (0.02, -0.03, 0.01, -0.02, *[0.0] * 8)
@@ -82,7 +82,6 @@ def test_pixels_of_the_reference_are_those_of_opencv(fisheye):
 
 
 @pytest.mark.parametrize("fisheye, shutter", CASES)
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_splats_and_gradients_match_the_reference(backend, fisheye, shutter):
     device, dtype = backend
     exact = dtype == torch.float64

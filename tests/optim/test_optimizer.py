@@ -10,7 +10,7 @@ import torch
 
 from blitzgs.ops.lazy_adam import AdamSchedule, GrowingSchedule
 from blitzgs.optim import LazyAdam
-from tests.helpers import BACKENDS, DEVICES, refused, relative_error
+from tests.helpers import refused, relative_error
 
 LR = 2.0**-7  # a float32, as LazyAdam rounds learning rates to
 BOUND = {torch.float32: 3e-5, torch.float64: 1e-11}
@@ -107,7 +107,6 @@ class Pair:
                     params[group["name"]] = new
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(
     "options", [{}, {"eps": 1e-15}, {"betas": (0.5, 0.9)}, {"betas": (0.0, 0.99)}], ids=str
 )
@@ -121,7 +120,6 @@ def test_steps_equal_dense_adam(backend, options):
     pair.require_equal()
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_rows_may_have_a_thousand_pending_steps(backend):
     pair = Pair(backend, rows=30)
     pair.step(1.0)
@@ -140,7 +138,6 @@ def test_learning_rates_follow_a_scheduler():
     pair.require_equal()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_the_first_values_of_a_row_may_have_a_rate_of_their_own(device):
     generator = torch.Generator().manual_seed(1)
     start = torch.randn(20, 16, 3, generator=generator).to(device)
@@ -158,7 +155,6 @@ def test_the_first_values_of_a_row_may_have_a_rate_of_their_own(device):
     assert relative_error(sh, torch.cat([dc, rest], 1)) < 3e-5
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_dense_gradients_and_missing_ones(backend):
     pair = Pair(backend)
     for number in range(9):
@@ -172,7 +168,6 @@ def test_dense_gradients_and_missing_ones(backend):
     pair.require_equal()
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_rows_are_added_kept_and_reordered(backend):
     pair = Pair(backend)
 
@@ -205,7 +200,6 @@ def test_rows_are_added_kept_and_reordered(backend):
     pair.require_equal()
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("moments", [True, False])
 @pytest.mark.parametrize("apart", [True, False])
 def test_strategies_replace_parameters_and_state(backend, moments, apart):
@@ -270,7 +264,6 @@ def test_a_removed_group_leaves_the_others_as_they_were(index):
     pair.require_equal()
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_graph_that_saved_the_parameters_is_refused_after_a_step(backend):
     pair = Pair(backend)
     losses = [param.square().sum() for param in pair.lazy.values()]
@@ -279,7 +272,6 @@ def test_a_graph_that_saved_the_parameters_is_refused_after_a_step(backend):
         refused(RuntimeError, "modified by an inplace operation", loss.backward)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("adam_first", [True, False])
 @pytest.mark.parametrize(
     "options",
@@ -372,7 +364,6 @@ def test_the_old_name_of_catching_up():
     assert all(state.keys() == {"step", "exp_avg", "exp_avg_sq"} for state in pair.ours.state.values())
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_full_tables_restart_and_still_equal_dense_adam(backend, monkeypatch):
     monkeypatch.setattr(GrowingSchedule, "LENGTH", 40)
     pair = Pair(backend, eps=1e-8)
@@ -392,7 +383,6 @@ def test_full_tables_restart_and_still_equal_dense_adam(backend, monkeypatch):
             assert relative_error(ours[moment], dense[moment]) < BOUND[pair.dtype], name
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_growing_schedule_has_the_sums_of_one_known_in_advance(device):
     rates = torch.rand(400, 6, generator=torch.Generator().manual_seed(0)).to(device)
     dtype = torch.float64 if device == "cpu" else torch.float32

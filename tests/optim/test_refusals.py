@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from blitzgs.optim import LazyAdam
-from tests.helpers import needs_cuda, refused
+from tests.helpers import refused
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,6 @@ def test_wrong_use_is_refused():
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_memory_of_another_device_is_refused():
     """Kernels that read it would end all work of the process on the GPU."""
     param = torch.nn.Parameter(torch.ones(4, 3, device="cuda"))

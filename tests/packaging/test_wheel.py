@@ -71,7 +71,7 @@ def environment(request, tmp_path_factory):
 def model(environment):
     """The PLY file of a first model, which the environment has trained."""
     run(environment, "blitzgs", "synth", "city", "--views=24", "--width=96", "--height=64")
-    arguments = ("--config=smoke", "--data=city", "--out=run", "--schedule.scale=0.05")
+    arguments = ("--config=smoke", "--data=city", "--out=run", "--schedule.scale=0.25")
     run(environment, "blitzgs", "train", *arguments)
     run(environment, "blitzgs", "export", "run", "--ply", "model.ply")
     return environment / "model.ply"

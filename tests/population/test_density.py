@@ -25,7 +25,6 @@ from blitzgs.population.density import (
 from blitzgs.runs.clean import floaters, views_counting
 from blitzgs.table.placement import place
 from blitzgs.table.table import PARAMETERS, GaussianTable
-from tests.helpers import needs_cuda
 
 TIME, STEP, SEED, LEVELS = 1200, 300, 9, 4
 
@@ -230,7 +229,6 @@ def test_the_cpu_has_no_limit_of_memory():
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_a_gpu_holds_more_than_a_small_table_and_less_than_its_memory():
     table = random_table(100_000)
     table = type(table)({name: table[name].cuda() for name in table})
@@ -241,7 +239,6 @@ def test_a_gpu_holds_more_than_a_small_table_and_less_than_its_memory():
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_a_table_on_the_host_is_limited_by_the_memory_of_the_host(monkeypatch):
     table, ranks = random_table(999), Ranks(device=torch.device("cuda"), local_world_size=2)
     sizes = table.row_bytes.values()

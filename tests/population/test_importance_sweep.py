@@ -28,7 +28,7 @@ from blitzgs.reference.render import scores as by_definition
 from blitzgs.reference.render import top_mass
 from blitzgs.table.table import GaussianTable
 from tests.distributed.rank_harness import on_cuda, on_each_device, run_ranks
-from tests.helpers import DEVICES, look_at_origin, needs_cuda
+from tests.helpers import look_at_origin
 from tests.training.tiny import random_gaussians
 
 ALONE = Ranks()
@@ -88,7 +88,6 @@ def dense_survey(table):
     return units, pixels, visible, squares
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_sweep_is_the_definition(device):
     ranks = Ranks(device=torch.device(device))
     table = population(ranks)
@@ -109,7 +108,6 @@ def test_sweep_is_the_definition(device):
     assert not found.score[:20].any() and found.score[300:].min() > 0
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_energy_is_the_squared_error_of_removing(device):
     """White Gaussians that do not overlap, on black: without one, the image's squared error is its energy."""
     x, y = torch.meshgrid(torch.arange(-2.0, 3), torch.arange(-2.0, 3), indexing="ij")
@@ -138,7 +136,6 @@ def test_energy_is_the_squared_error_of_removing(device):
     assert torch.allclose(energy.double(), torch.stack(errors), rtol=1e-4)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_survey_equals_contributions(device):
     """They agree up to rounding of the activations; one orders equal depths by id, the other by row."""
     table = population(Ranks(device=torch.device(device)))
@@ -157,7 +154,6 @@ def test_survey_equals_contributions(device):
             assert difference.abs().max() <= 1e-5 * counts[k].max() + 0.02
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_survey_reads_no_colours(device):
     table = population(Ranks(device=torch.device(device)))
     views = cameras(3, device)
@@ -169,7 +165,6 @@ def test_a_survey_reads_no_colours(device):
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_cuts_that_lag_behind_the_surveys_change_no_bit(monkeypatch):
     ranks, add = Ranks(device=torch.device("cuda")), importance._Sums.add
     table = population(ranks)

@@ -22,7 +22,6 @@ from blitzgs.spawn.lineage import Cause
 from blitzgs.table.table import EXP_AVG_SQS, PARAMETERS, GaussianTable, opacity_logit
 from blitzgs.view.levels import Levels, measure_levels
 from tests.distributed.rank_harness import run_ranks
-from tests.helpers import DEVICES, needs_cuda
 from tests.population.test_density import LEVELS, SEED, STEP, TIME, random_table
 
 
@@ -35,7 +34,7 @@ def scene(scale=1.0):
 
 
 def make(points, colors, centres, threshold=0.5):
-    levels = measure_levels(points, centres, 2.0, 0.01)
+    levels = measure_levels(points, centres, 2.0)
     return levels, octree_gaussians(points, colors, centres, levels, threshold).table(2, 0.1)
 
 
@@ -98,7 +97,7 @@ def test_a_stray_point_does_not_spoil_the_grid():
     points, colors, centres = scene()
     _, table = make(points, colors, centres)
     stray = torch.cat((points, torch.full((1, 3), -1e9, dtype=torch.float64)))
-    levels = measure_levels(points, centres, 2.0, 0.01)
+    levels = measure_levels(points, centres, 2.0)
     spoilt = octree_gaussians(stray, torch.cat((colors, colors[:1])), centres, levels, 0.5).table(2, 0.1)
     assert abs(len(spoilt) - len(table)) < 0.1 * len(table)
     assert spoilt["means"].abs().max() < 10
@@ -115,7 +114,7 @@ def test_one_point():
 
 def test_parts_of_the_first_gaussians_are_rows_of_the_whole_table():
     points, colors, centres = scene()
-    first = octree_gaussians(points, colors, centres, measure_levels(points, centres, 2.0, 0.01), 0.5)
+    first = octree_gaussians(points, colors, centres, measure_levels(points, centres, 2.0), 0.5)
     whole, parts = first.table(1, 0.1), [first.table(1, 0.1, part=slice(rank, None, 3)) for rank in range(3)]
     for rank, part in enumerate(parts):
         for name in whole:
@@ -181,7 +180,6 @@ def test_the_copies_of_other_rows_change_no_bit():
     assert [tuple(part.shape) for part in none] == [(0,), (0, 3)]
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_rows_that_stand_for_copies_equal_torch_s(device):
     n, least = 3 * MAX_COPIES, opacity_logit(0.05)
     g = torch.Generator().manual_seed(4)
@@ -203,7 +201,6 @@ def test_rows_that_stand_for_copies_equal_torch_s(device):
         torch.testing.assert_close(column.cpu(), wanted, rtol=3e-7, atol=0)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_draws_and_what_is_left_of_them_equal_torch_s(device):
     g = torch.Generator().manual_seed(6)
     opacities, causes = torch.randn(5000, generator=g) * 4, torch.randint(2, (5000,), generator=g).byte()
@@ -357,7 +354,6 @@ def test_no_live_gaussian_leaves_nothing_to_copy():
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_cuda_does_the_same():
     tables = []
     for device in ("cpu", "cuda"):

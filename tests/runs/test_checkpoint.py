@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-import errno
 import json
 import os
 import resource
@@ -17,7 +16,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.runs import checkpoint, checkpoint_files, trained_model
 from tests.distributed.rank_harness import CONTEXT, all_fail, run_ranks
 from tests.helpers import refused, save_checkpoint
-from tests.training.tiny import random_gaussians, tiny_config
+from tests.training.tiny import assert_same_table, random_gaussians, sorted_rows, tiny_config
 
 ALONE = Ranks()
 
@@ -35,16 +34,6 @@ def table(rows, seed=0):
     }
 
 
-def equal(a, b):
-    return sorted(a) == sorted(b) and all(torch.equal(a[name], b[name]) for name in a)
-
-
-def by_id(shards):
-    whole = {name: torch.cat([shard[name] for shard in shards]) for name in shards[0]}
-    order = whole["id"].argsort()
-    return {name: column[order] for name, column in whole.items()}
-
-
 def latest(directory, ranks=ALONE):
     found = checkpoint.newest(directory, ranks, lambda path: checkpoint.load(path, ranks, "cpu"))
     return found and found[0]
@@ -54,21 +43,26 @@ def test_round_trip_and_format(tmp_path):
     columns, state = table(101), {"iteration": 7, "note": ["ä", 1.5, None]}
     path = save_checkpoint(tmp_path / "checkpoints", columns, state, ALONE)
     loaded = latest(tmp_path / "checkpoints")
-    assert equal(loaded.columns, columns) and loaded.state == state
+    assert_same_table(loaded.columns, columns)
+    assert loaded.state == state
     assert checkpoint.newest(path.parent, ALONE, str) == (str(path), path, [])
     # The shard is an ordinary safetensors file.
-    assert equal(load_file(path / "shard_0000_of_0001.safetensors"), columns)
+    assert_same_table(load_file(path / "shard_0000_of_0001.safetensors"), columns)
     assert latest(tmp_path / "nothing here") is None
     empty = table(0)
     save_checkpoint(tmp_path / "checkpoints", empty, state, ALONE)
-    assert equal(latest(tmp_path / "checkpoints").columns, empty)
+    assert_same_table(latest(tmp_path / "checkpoints").columns, empty)
 
 
-def test_keeps_the_last_k(tmp_path):
-    for iteration in range(5):
-        save_checkpoint(tmp_path, table(3, iteration), {"iteration": iteration}, ALONE, keep=2)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["checkpoint_000003", "checkpoint_000004"]
-    assert latest(tmp_path).state == {"iteration": 4}
+@pytest.mark.parametrize("first", [0, 1_000_000])
+def test_keeps_the_last_k(tmp_path, first):
+    if first > 0:
+        (tmp_path / f"checkpoint_{first - 1}").mkdir()
+    for number in range(first, first + 5):
+        path = save_checkpoint(tmp_path, table(3), {"iteration": number}, ALONE, keep=2)
+        assert path.name == f"checkpoint_{number:06d}"
+    assert {p.name for p in tmp_path.iterdir()} == {f"checkpoint_{first + k:06d}" for k in (3, 4)}
+    assert latest(tmp_path).state == {"iteration": first + 4}
 
 
 def _flip_bit(path, offset):
@@ -100,7 +94,7 @@ def test_a_damaged_checkpoint_is_refused_by_name(tmp_path, damage, reason):
     ):
         loaded = latest(tmp_path)
     assert loaded.state == {"iteration": 1}
-    assert equal(loaded.columns, table(50, 1))
+    assert_same_table(loaded.columns, table(50, 1))
     with pytest.raises(checkpoint.CheckpointError, match=f"checkpoint_000001 is damaged.*{reason}"):
         checkpoint.load(newest, ALONE, "cpu")
     # A new save does not reuse the damaged one's name.
@@ -159,7 +153,7 @@ def test_kill_at_any_point_of_a_save(tmp_path):
             warnings.simplefilter("error")
             loaded = latest(directory)
         found.append(loaded.state["iteration"])
-        assert equal(loaded.columns, table(64, found[-1]))
+        assert_same_table(loaded.columns, table(64, found[-1]))
         # The next save clears what was left behind.
         save_checkpoint(directory, table(4), {}, ALONE, keep=2)
         assert len(list(directory.iterdir())) == 2
@@ -192,36 +186,6 @@ def test_full_disk(tmp_path, monkeypatch):
     assert latest(tmp_path).state == {"iteration": 0}
 
 
-@pytest.mark.parametrize(
-    ("error", "waits", "text"),
-    [
-        (errno.ENOSPC, True, "the disk is full"),
-        (errno.EDQUOT, True, "the disk is full"),
-        (errno.EFBIG, False, "a file is larger than is allowed"),
-        (errno.EACCES, False, "Permission denied"),
-        (errno.EIO, False, "Input/output error"),
-        (errno.EROFS, False, "Read-only file system"),
-    ],
-)
-def test_an_error_tells_whether_space_would_help(tmp_path, monkeypatch, error, waits, text):
-    def write_shard(*_):
-        raise OSError(error, os.strerror(error))
-
-    monkeypatch.setattr(checkpoint, "write_shard", write_shard)
-    with pytest.raises(checkpoint.CheckpointError, match=text) as failure:
-        save_checkpoint(tmp_path, table(4), {}, ALONE)
-    assert failure.value.lacks_space == waits
-
-
-def test_numbers_may_have_more_than_six_digits(tmp_path):
-    (tmp_path / "checkpoint_999999").mkdir()
-    for number in range(1_000_000, 1_000_003):
-        path = save_checkpoint(tmp_path, table(4), {"iteration": number}, ALONE, keep=2)
-        assert path.name == f"checkpoint_{number}"
-    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["checkpoint_1000001", "checkpoint_1000002"]
-    assert latest(tmp_path).state == {"iteration": 1_000_002}
-
-
 def _refuse(monkeypatch, method, folder):
     original = getattr(checkpoint.Path, method)
 
@@ -252,21 +216,10 @@ def test_a_folder_that_cannot_be_read_is_a_failed_checkpoint(tmp_path, monkeypat
         save_checkpoint(tmp_path, table(3), {}, ALONE)
 
 
-def test_bad_arguments(tmp_path):
-    with pytest.raises(ValueError, match="of one length"):
-        save_checkpoint(tmp_path, {"a": torch.zeros(2), "b": torch.zeros(3)}, {}, ALONE)
-    refused(ValueError, "keep must be at least 1", save_checkpoint, tmp_path, table(2), {}, ALONE, keep=0)
-    with pytest.raises(ValueError, match="column a has dtype torch.complex64"):
-        save_checkpoint(tmp_path, {"a": torch.zeros(2, dtype=torch.complex64)}, {}, ALONE)
-
-
-def _shard_of(whole, ranks, sizes):
-    start = sum(sizes[: ranks.rank])
-    return {name: column[start : start + sizes[ranks.rank]] for name, column in whole.items()}
-
-
 def _save_shard(ranks, directory, sizes):
-    return save_checkpoint(directory, _shard_of(table(sum(sizes)), ranks, sizes), {"m": 4}, ranks).name
+    begin, end = (sum(sizes[:rank]) for rank in (ranks.rank, ranks.rank + 1))
+    shard = {name: column[begin:end] for name, column in table(sum(sizes)).items()}
+    return save_checkpoint(directory, shard, {"m": 4}, ranks).name
 
 
 def _load_shard(ranks, directory):
@@ -283,12 +236,13 @@ def _save_with_one_full_disk(ranks, directory, sizes):
 def test_save_at_four_ranks_load_at_any_number(tmp_path):
     sizes = [30, 0, 11, 60]
     assert run_ranks(_save_shard, 4, tmp_path, sizes) == ["checkpoint_000000"] * 4
-    whole = by_id([table(sum(sizes))])
+    whole = sorted_rows(table(sum(sizes)))
     for world_size in (1, 2, 3, 4):
         answers = run_ranks(_load_shard, world_size, tmp_path)
         shards = [columns for columns, _ in answers]
         assert all(state == {"m": 4} for _, state in answers)
-        assert equal(by_id(shards), whole)
+        together = {name: torch.cat([shard[name] for shard in shards]) for name in whole}
+        assert_same_table(sorted_rows(together), whole)
         lengths = [len(shard["id"]) for shard in shards]
         if world_size == 4:
             assert lengths == sizes  # as saved
@@ -308,19 +262,19 @@ def test_dealing_keeps_the_order_and_opens_only_what_it_needs(tmp_path):
         file = tmp_path / f"{m}.safetensors"
         size, digest = checkpoint.write_shard(file, columns)
         shards.append(checkpoint_files.Shard(file.name, len(columns["id"]), size, digest))
-    assert equal(checkpoint.read_share(tmp_path, shards, ALONE, torch.device("cpu")), whole)
+    assert_same_table(checkpoint.read_share(tmp_path, shards, ALONE, torch.device("cpu")), whole)
     # Rows 1, 3, 5, ... are in the second and the fourth file; of the first, only the header is read.
     first = tmp_path / shards[0].file
     first.write_bytes(first.read_bytes()[:-1])
     (tmp_path / shards[2].file).unlink()
     share = checkpoint.read_share(tmp_path, shards, Ranks(rank=1, world_size=2), torch.device("cpu"))
-    assert equal(share, {name: column[1::2] for name, column in whole.items()})
+    assert_same_table(share, {name: column[1::2] for name, column in whole.items()})
 
 
 def test_shared_columns_are_saved_and_checked(tmp_path):
     shared = {"costs": torch.rand(7), "views": torch.arange(3), "none": torch.empty(0, 4)}
     path = save_checkpoint(tmp_path, table(5), {}, ALONE, shared=shared)
-    assert equal(latest(tmp_path).shared, shared)
+    assert_same_table(latest(tmp_path).shared, shared)
     _flip_bit(path / checkpoint.SHARED, -1)
     refused(checkpoint.CheckpointError, "shared.* not match its SHA-256", checkpoint.load, path, ALONE, "cpu")
     (path / checkpoint.SHARED).unlink()

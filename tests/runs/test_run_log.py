@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a run checks of its folder, what it shows while it works, and how it stops."""
 
+import errno
 import json
 import shutil
 import subprocess
@@ -17,16 +18,11 @@ from blitzgs.runs import log as run_log
 from blitzgs.runs.folder_checks import FolderError, check_room, check_writable, locked
 from blitzgs.runs.guard import LossGuard, NonFiniteError
 from blitzgs.runs.log import RunLog
-from blitzgs.runs.run_files import LOG
 from blitzgs.runs.trained_model import known_id
-from blitzgs.training.trainer import Trainer
 from blitzgs.util import progress
 from tests.distributed.rank_harness import all_fail
-from tests.training.tiny import OVERRIDES, as_flags, tiny_config, tiny_scene, write_tiny_capture
-
-
-def records(folder):
-    return [json.loads(line) for line in (folder / LOG).read_text().splitlines()]
+from tests.helpers import refused
+from tests.training.tiny import OVERRIDES, as_flags, make_trainer, read_log, write_tiny_capture
 
 
 def work_on(folder, monkeypatch, terminal):
@@ -50,7 +46,7 @@ def work_on(folder, monkeypatch, terminal):
 def test_a_terminal_shows_every_step_and_the_evaluation(tmp_path, monkeypatch, capsys):
     position, bars = work_on(tmp_path, monkeypatch, terminal=True)
     assert position == 3 and bars == [("loss 0.5000", 3), ("views measured", 2)]
-    assert [record["t"] for record in records(tmp_path)] == [3]
+    assert [record["t"] for record in read_log(tmp_path)] == [3]
 
 
 def test_the_bar_moves_now_and_then_and_to_its_end(tmp_path, monkeypatch, capsys):
@@ -84,7 +80,7 @@ def test_elsewhere_long_work_prints_a_line_now_and_then(tmp_path, monkeypatch, c
     monkeypatch.setattr(progress, "LINE_SECONDS", 0.0)
     work_on(tmp_path, monkeypatch, terminal=False)
     assert "1 of 2 views measured" in capsys.readouterr().out
-    assert [record["t"] for record in records(tmp_path)] == [3, 3]
+    assert [record["t"] for record in read_log(tmp_path)] == [3, 3]
 
 
 def test_other_ranks_show_nothing(monkeypatch, capsys):
@@ -114,7 +110,7 @@ def test_what_is_shown_is_a_running_mean_and_the_held_out_figure(tmp_path, monke
     assert "loss 0.4000  train 25.00 dB" in lines[1]
     assert "loss 0.1000  train 24.00 dB  held-out 22.50 dB" in lines[-2]
     assert "bad \\x1b[2J name" in lines[-1]
-    assert [record["psnr"] for record in records(tmp_path)[:2]] == [20.0, 30.0]  # each view's own
+    assert [record["psnr"] for record in read_log(tmp_path)[:2]] == [20.0, 30.0]  # each view's own
 
 
 class OnCuda:
@@ -139,8 +135,7 @@ class Sums:
 
 @pytest.fixture(scope="module")
 def frame(tmp_path_factory):
-    config = tiny_config("schedule.batch_size=2")
-    running = Trainer(config, *tiny_scene(), tmp_path_factory.mktemp("frame"), Ranks())
+    running = make_trainer(tmp_path_factory.mktemp("frame"), "schedule.batch_size=2")
     batch = running.loader.get(0, 1)
     rendered, *_ = running.state.stepper.forward(1, running.state.render_options, batch)
     running.close()
@@ -169,12 +164,11 @@ def test_the_guard_names_the_pixel_and_says_what_it_has_looked_at(frame):
     images = rendered.renders.clone()
     images[1, 7, 11, 2] = float("nan")
     bad = Sums(0, float("nan"), 0, 0)
-    with pytest.raises(NonFiniteError, match=r"op rasterize, output renders: view 'b', pixel \(11, 7\)"):
-        LossGuard().check(9, ("a", "b"), bad, table, rendered._replace(renders=images))
-    with pytest.raises(
-        NonFiniteError, match="projected Gaussians and images are finite: it comes from op photom"
+    for shown, text in (
+        (rendered._replace(renders=images), r"op rasterize, output renders: view 'b', pixel \(11, 7\)"),
+        (rendered, "projected Gaussians and images are finite: it comes from op photometric"),
     ):
-        LossGuard().check(9, ("a", "b"), bad, table, rendered)
+        refused(NonFiniteError, text, LossGuard().check, 9, ("a", "b"), bad, table, shown)
     # A step later, the message does not name data that no longer exist.
     guard, late = LossGuard(), rendered._replace(renders=OnCuda(rendered.renders))
     guard.check(9, ("a", "b"), bad, table, late)
@@ -203,34 +197,29 @@ ROOT = Path(__file__).parents[2]
 
 def test_a_folder_that_cannot_be_written_is_refused_at_once(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    with pytest.raises(FolderError, match=r"file/run cannot be written: rank 0 \(.*Not a directory"):
-        check_writable(tmp_path / "file" / "run", Ranks())
+    no_folder = r"file/run cannot be written: rank 0 \(.*Not a directory"
+    refused(FolderError, no_folder, check_writable, tmp_path / "file" / "run", Ranks())
     usage = type("Usage", (), {"free": 1000})
     monkeypatch.setattr("shutil.disk_usage", lambda path: usage)
-    with pytest.raises(FolderError, match=r"a checkpoint takes .* kB and 1.00 kB are free"):
-        Trainer(tiny_config(), *tiny_scene(), tmp_path / "run", Ranks())
+    full = r"a checkpoint takes .* kB and 1.00 kB are free"
+    refused(FolderError, full, make_trainer, tmp_path / "run")
     monkeypatch.undo()
-    table = Trainer(tiny_config(), *tiny_scene(), tmp_path / "run", Ranks()).state.table
+    table = make_trainer(tmp_path / "run").state.table
     with pytest.warns(UserWarning, match="two checkpoints of 9,000,000,000,000 Gaussians take"):
         check_room(tmp_path, table, Ranks(), 9_000_000_000_000)
     assert not list(tmp_path.rglob(".probe*"))
 
 
 @pytest.mark.parametrize(
-    "name", ["config.yaml", "cameras.json", "log.jsonl", "summary.json", "trajectory.svg", "lineage"]
+    "name",
+    ["config.yaml", "cameras.json", "log.jsonl", "summary.json", "trajectory.svg", "lineage", "checkpoints"],
 )
 @pytest.mark.parametrize("resume", [True, False])
 def test_files_of_other_programs_are_not_replaced(tmp_path, name, resume):
     (tmp_path / name).write_text("precious")
-    with pytest.raises(FileExistsError, match=f"has {name}, which a run would replace"):
-        Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks(), resume=resume)
+    replaced = "Not a directory" if name == "checkpoints" else f"has {name}, which a run would replace"
+    refused((FileExistsError, NotADirectoryError), replaced, make_trainer, tmp_path, resume=resume)
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "precious")]
-
-
-def test_a_file_in_the_place_of_the_checkpoints_is_found_at_once(tmp_path):
-    (tmp_path / "checkpoints").write_text("")
-    with pytest.raises(NotADirectoryError, match="checkpoints"):
-        Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks())
 
 
 def _check(ranks, folders):
@@ -240,14 +229,6 @@ def _check(ranks, folders):
 def test_folders_are_checked_on_every_rank(tmp_path):
     all_fail(r"cannot be written: rank 1 \(", _check, [str(tmp_path / "a"), "/proc/nothing"])
     all_fail("ranks 1 do not see what rank 0 writes", _check, [str(tmp_path / "a"), str(tmp_path / "b")])
-
-
-def test_a_capture_that_cannot_be_read_leaves_no_folder(tmp_path):
-    flags = as_flags("config=defaults", *OVERRIDES, "schedule.iterations=2")
-    command = ["train", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run"), *flags]
-    assert main(command) == 1 and not (tmp_path / "run").exists()
-    write_tiny_capture(tmp_path / "data")
-    assert main(command) == 0
 
 
 def test_one_run_at_a_time(tmp_path, monkeypatch, failure):
@@ -276,6 +257,16 @@ def test_one_run_at_a_time(tmp_path, monkeypatch, failure):
         pass
 
 
+def test_a_full_disk_is_named_by_the_check_and_not_by_the_lock(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("os.pwrite", full)
+    monkeypatch.setattr("os.fsync", full)
+    with locked(tmp_path, Ranks()), pytest.raises(FolderError, match="cannot be written: .* No space left"):
+        check_writable(tmp_path, Ranks())
+
+
 @pytest.fixture(scope="module")
 def other(trained, tmp_path_factory):
     """Another run of the same capture."""
@@ -292,7 +283,7 @@ def other(trained, tmp_path_factory):
         ("eval", "log"),
     ],
 )
-def test_a_checkpoint_of_another_run_is_refused(trained, other, tmp_path, capsys, command, known_by):
+def test_a_checkpoint_of_another_run_is_refused(trained, other, tmp_path, failure, command, known_by):
     run = tmp_path / "run"
     shutil.copytree(trained[1], run)
     if known_by == "log":  # as in runs of earlier versions
@@ -310,10 +301,8 @@ def test_a_checkpoint_of_another_run_is_refused(trained, other, tmp_path, capsys
     shutil.rmtree(run / "checkpoints")
     shutil.copytree(other / "checkpoints", run / "checkpoints")
     shutil.rmtree(tmp_path / "out", ignore_errors=True)
-    capsys.readouterr()
-    assert main(arguments) == 1
-    shown = " ".join(capsys.readouterr().err.split())
-    assert f"was written by another run ({known_id(other)}) than the one in {run} ({known_id(run)})" in shown
+    another = f"was written by another run ({known_id(other)}) than the one in {run} ({known_id(run)})"
+    assert another in failure(*arguments)
     assert not (tmp_path / "out").exists()
 
 

@@ -9,6 +9,7 @@ from PIL import Image
 
 from blitzgs.capture.cameras import camera_centres
 from blitzgs.capture.world import fit_similarity
+from tests.capture.helpers import write_image
 
 WIDTH, HEIGHT, FOCAL = 400, 300, 380.0
 # Height, and the square [x0, y0, x1, y1] that a slab covers.
@@ -59,12 +60,9 @@ def _texture(seed: int, rows: int, columns: int) -> np.ndarray:
 
 def write_photographs(folder: Path, count: int = 8) -> np.ndarray:
     """Write view_0.jpg, view_1.jpg, ... and return their poses."""
-    folder.mkdir(parents=True, exist_ok=True)
     placed = poses(count)
     for index, pose in enumerate(placed):
-        assert cv2.imwrite(
-            str(folder / f"view_{index}.jpg"), photograph(pose), [cv2.IMWRITE_JPEG_QUALITY, 95]
-        )
+        write_image(folder / f"view_{index}.jpg", photograph(pose)[..., ::-1], cv2.IMWRITE_JPEG_QUALITY, 95)
     return placed
 
 

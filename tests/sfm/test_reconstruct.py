@@ -26,7 +26,7 @@ from blitzgs.sfm.photographs import Photographs, estimate, judge_positions
 from blitzgs.sfm.pycolmap_stage import features
 from blitzgs.sfm.reconstruct import Settings
 from blitzgs.sfm.report import Reconstruction, _reason, examine
-from tests.capture.helpers import Posed, opensfm, pix4d, realitycapture, warned
+from tests.capture.helpers import Posed, opensfm, pix4d, realitycapture, warned, write_image
 from tests.sfm.scene import FOCAL, aligned, with_gps, write_photographs
 from tests.training.tiny import OVERRIDES, as_flags
 
@@ -46,11 +46,10 @@ def made(tmp_path_factory):
     placed = write_photographs(root / "photos")
     whole = (root / "photos" / "view_0.jpg").read_bytes()
     (root / "photos" / "cut.jpg").write_bytes(whole[: len(whole) // 2])
-    assert cv2.imwrite(str(root / "photos" / "wall.jpg"), np.full((300, 400, 3), 128, np.uint8))
-    (root / "photos" / "masks").mkdir()  # a mask is no photograph
+    write_image(root / "photos" / "wall.jpg", np.full((300, 400, 3), 128, np.uint8))
     mask = np.full((150, 200), 255, np.uint8)
     mask[:, :20] = 0
-    assert cv2.imwrite(str(root / "photos" / "masks" / "view_3.jpg.png"), mask)
+    write_image(root / "photos" / "masks" / "view_3.jpg.png", mask)  # a mask is no photograph
     with pytest.warns(UserWarning, match="2 of 10 photographs have no camera"):
         assert main(["sfm", str(root / "photos"), str(root / "capture")]) == 0
         assert len(load_capture(root / "capture").cameras) == 8
@@ -222,10 +221,8 @@ def test_poses_take_their_time_on_many_cores(monkeypatch, cores, told):
 
 
 def test_photographs_of_nothing_have_no_poses(tmp_path, capsys):
-    (tmp_path / "photos").mkdir()
     for number in range(3):
-        grey = np.full((90, 120, 3), 100 + number, np.uint8)
-        assert cv2.imwrite(str(tmp_path / f"photos/{number}.png"), grey)
+        write_image(tmp_path / f"photos/{number}.png", np.full((90, 120, 3), 100 + number, np.uint8))
     for _ in range(2):
         assert main(["sfm", str(tmp_path / "photos"), str(tmp_path / "capture")]) == 1
         error = capsys.readouterr().err

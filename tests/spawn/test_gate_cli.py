@@ -22,17 +22,15 @@ parquet = pytest.importorskip("pyarrow.parquet")
 pytest.importorskip("xgboost")
 
 
-def test_a_run_that_is_not_finished_is_no_example(lineage_run, tmp_path, capsys):
+def test_a_run_that_is_not_finished_is_no_example(lineage_run, tmp_path, failure):
     folder = shutil.copytree(lineage_run / "run", tmp_path / "run")
     (folder / "summary.json").unlink()
-    gate, out = str(tmp_path / "g.json"), str(tmp_path / "out.json")
-    assert main(["gate", "fit", str(lineage_run / "run"), "--out", gate]) == 0
-    for arguments in (["fit", str(folder)], ["evaluate", gate, str(folder)]):
-        assert main(["gate", *arguments, "--out", out]) == 1
-        assert "is not finished (it has no summary.json)" in capsys.readouterr().err.replace("\n", " ")
+    for arguments in (["fit", folder], ["evaluate", "default", folder]):
+        error = failure("gate", *arguments, "--out", tmp_path / "out.json")
+        assert "is not finished (it has no summary.json)" in error.replace("\n", " ")
 
 
-def test_fit_evaluate_and_replay(lineage_run, tmp_path, capsys):
+def test_fit_evaluate_and_replay(lineage_run, tmp_path, capsys, failure):
     folder, run = lineage_run, str(lineage_run / "run")
     gate = str(tmp_path / "gates" / "tiny.json")
     assert main(["gate", "fit", run, "--out", gate]) == 0
@@ -66,8 +64,8 @@ def test_fit_evaluate_and_replay(lineage_run, tmp_path, capsys):
     assert all(f"arm {name}:\n" in printed for name in arms)
     # The first gated event is the same as in the reference, so the oracle knows each of its candidates.
     assert [r["t"] for r in events_of(tmp_path / "replay" / "oracle", "densify")] == [60, 80]
-    assert main(["gate", "replay", gate, run, "--out", str(tmp_path / "replay")]) == 1
-    assert "already holds a replay: choose another --out" in capsys.readouterr().err.replace("\n", " ")
+    error = failure("gate", "replay", gate, run, "--out", tmp_path / "replay")
+    assert "already holds a replay: choose another --out" in error.replace("\n", " ")
 
 
 def test_a_gate_can_be_fitted_on_samples(lineage_run, tmp_path, capsys, failure):
@@ -96,21 +94,21 @@ def test_a_gate_can_be_fitted_on_samples(lineage_run, tmp_path, capsys, failure)
     for source, gate in zip((lineage_run / "run", sample), gates, strict=True):
         assert main(["gate", "fit", str(source), "--out", str(gate)]) == 0
     assert gates[0].read_bytes() == gates[1].read_bytes()
-    assert main(["gate", "fit", str(tmp_path / "none.parquet"), "--out", str(gates[0])]) == 1
-    assert "there is no such sample of spawns" in capsys.readouterr().err
+    none = tmp_path / "none.parquet"
+    assert "there is no such sample of spawns" in failure("gate", "fit", none, "--out", gates[0])
     (tmp_path / "text.parquet").write_text("text")
     assert "is not a Parquet file" in failure("gate", "fit", tmp_path / "text.parquet", "--out", gates[0])
     births = str(next((lineage_run / "run" / "lineage").glob("births*.parquet")))
     assert "is not a sample of spawns" in failure("gate", "fit", births, "--out", gates[0]).replace("\n", " ")
 
 
-def test_no_other_file_is_replaced(lineage_run, tmp_path, capsys):
+def test_no_other_file_is_replaced(lineage_run, tmp_path, failure):
     run, gate = shutil.copytree(lineage_run / "run", tmp_path / "run"), tmp_path / "gate.json"
     assert main(["gate", "fit", str(run), "--out", str(gate)]) == 0
     births = next((run / "lineage").glob("births*.parquet"))
     before = births.read_bytes()
-    assert main(["gate", "sample", str(run), "--out", str(births)]) == 1
-    assert "is not a sample of spawns: choose another --out" in capsys.readouterr().err
+    error = failure("gate", "sample", run, "--out", births)
+    assert "is not a sample of spawns: choose another --out" in error
     assert births.read_bytes() == before
     sample = str(tmp_path / "sample.parquet")
     for _ in range(2):
@@ -119,14 +117,13 @@ def test_no_other_file_is_replaced(lineage_run, tmp_path, capsys):
     mine.mkdir()
     for name in ("evaluation.json", "survival.svg", "regions_capture.svg"):
         (mine / name).write_text("mine")
-        assert main(["gate", "evaluate", str(gate), str(run), "--out", str(mine)]) == 1
         error = f"{mine / name} exists, and no earlier call of blitzgs wrote to {mine}: choose another --out"
-        assert error in capsys.readouterr().err
+        assert error in failure("gate", "evaluate", gate, run, "--out", mine)
         assert [path.read_text() for path in mine.iterdir()] == ["mine"]
         (mine / name).unlink()
     (mine / "replay.json").write_text("mine")
-    assert main(["gate", "replay", str(gate), str(run), "--out", str(mine)]) == 1
-    assert "already holds a replay: choose another --out" in capsys.readouterr().err
+    error = failure("gate", "replay", gate, run, "--out", mine)
+    assert "already holds a replay: choose another --out" in error
     assert (mine / "replay.json").read_text() == "mine"
 
 
@@ -184,24 +181,21 @@ def test_runs_of_the_same_name_have_pictures_of_their_own(lineage_run, tmp_path)
         ("about", lambda data: b"{}", "the description of the run is damaged: it has no name, scene"),
     ],
 )
-def test_a_damaged_lineage_is_named(lineage_run, tmp_path, capsys, name, damage, message):
+def test_a_damaged_lineage_is_named(lineage_run, tmp_path, failure, name, damage, message):
     run = shutil.copytree(lineage_run / "run", tmp_path / "run")
     file = next((run / "lineage").glob(f"{name}*"))
     file.write_bytes(damage(file.read_bytes()))
-    assert main(["gate", "fit", str(run), "--out", str(tmp_path / "gate.json")]) == 1
-    error = capsys.readouterr().err
+    error = failure("gate", "fit", run, "--out", tmp_path / "gate.json")
     assert str(file) in error and message in error
 
 
 @pytest.mark.parametrize("table", ["births", "deaths"])
 @pytest.mark.parametrize("which", [0, -1])
-def test_a_lost_file_of_the_lineage_is_noticed(lineage_run, tmp_path, capsys, table, which):
+def test_a_lost_file_of_the_lineage_is_noticed(lineage_run, tmp_path, failure, table, which):
     run = shutil.copytree(lineage_run / "run", tmp_path / "run")
     sorted((run / "lineage").glob(f"{table}*"))[which].unlink()
-    assert main(["gate", "fit", str(run), "--out", str(tmp_path / "gate.json")]) == 1
-    assert "lineage is not complete: a file of its births or deaths is lost" in " ".join(
-        capsys.readouterr().err.split()
-    )
+    error = failure("gate", "fit", run, "--out", tmp_path / "gate.json").replace("\n", " ")
+    assert "lineage is not complete: a file of its births or deaths is lost" in error
 
 
 @pytest.mark.parametrize(
@@ -212,12 +206,11 @@ def test_a_lost_file_of_the_lineage_is_noticed(lineage_run, tmp_path, capsys, ta
         (lambda data: with_about(data, b"{}"), "the description of the run is damaged"),
     ],
 )
-def test_a_damaged_sample_is_named(lineage_run, tmp_path, capsys, damage, message):
+def test_a_damaged_sample_is_named(lineage_run, tmp_path, failure, damage, message):
     sample = tmp_path / "sample.parquet"
     assert main(["gate", "sample", str(lineage_run / "run"), "--out", str(sample)]) == 0
     sample.write_bytes(damage(sample.read_bytes()))
-    assert main(["gate", "fit", str(sample), "--out", str(tmp_path / "gate.json")]) == 1
-    error = capsys.readouterr().err
+    error = failure("gate", "fit", sample, "--out", tmp_path / "gate.json")
     assert str(sample) in error and message in error
 
 
@@ -248,19 +241,15 @@ def with_about(data, text):
     return changed(data, lambda table: table.replace_schema_metadata({b"blitzgs.spawns": text}))
 
 
-def test_what_is_missing_is_named(tmp_path, capsys, failure):
-    assert main(["gate", "fit", str(tmp_path), "--out", str(tmp_path / "g.json")]) == 1
-    assert "holds no lineage: train with --population.lineage=true" in capsys.readouterr().err
-    assert main(["gate", "fit", str(tmp_path / "no"), "--out", str(tmp_path / "g.json")]) == 1
-    assert "no is not the folder of a run" in capsys.readouterr().err
-    assert main(["gate", "fit", str(tmp_path), "--gate-from=nan", "--out", str(tmp_path / "g.json")]) == 1
-    assert "--gate-from: must be 0 or more, got nan" in capsys.readouterr().err
+def test_what_is_missing_is_named(tmp_path, failure):
+    gate = tmp_path / "g.json"
+    fit, evaluate = ["gate", "fit", "--out", gate], ["gate", "evaluate", gate, "x", "--out", tmp_path]
+    assert "holds no lineage: train with --population.lineage=true" in failure(*fit, tmp_path)
+    assert "no is not the folder of a run" in failure(*fit, tmp_path / "no")
     assert "a gate's file ends in .json" in failure("gate", "fit", tmp_path, "--out", tmp_path / "g.txt")
-    assert main(["gate", "evaluate", str(tmp_path / "g.json"), "x", "--out", str(tmp_path)]) == 1
-    assert "g.json: no such gate; `blitzgs gate fit` makes one" in capsys.readouterr().err
-    (tmp_path / "g.json").write_text("{}")
-    assert main(["gate", "evaluate", str(tmp_path / "g.json"), "x", "--out", str(tmp_path)]) == 1
-    assert "g.meta.json is missing: a gate is a model and its metadata" in capsys.readouterr().err
+    assert "g.json: no such gate; `blitzgs gate fit` makes one" in failure(*evaluate)
+    gate.write_text("{}")
+    assert "g.meta.json is missing: a gate is a model and its metadata" in failure(*evaluate)
 
 
 def test_regions_and_cohorts_of_a_known_picture():

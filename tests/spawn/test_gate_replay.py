@@ -7,7 +7,6 @@ from dataclasses import replace
 from itertools import islice
 from unittest.mock import Mock
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -22,6 +21,7 @@ from blitzgs.spawn.gate import SpawnGate, gate_file
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.replay import OracleVeto, branch_point, event_keys, label_events, replay
 from blitzgs.training.trainer import Trainer
+from tests.capture.helpers import write_image
 from tests.conftest import LINEAGE
 from tests.distributed.rank_harness import run_ranks
 from tests.helpers import refused
@@ -36,14 +36,11 @@ def test_a_replay_that_repeats_the_reference_matches_it_though_the_population_is
     lineage_run, tmp_path
 ):
     """Candidates that the limit held back are candidates of both continuations."""
-    capture, gate = str(lineage_run / "capture"), str(tmp_path / "g.json")
     limited, out = str(tmp_path / "run"), tmp_path / "replay"
-    flags = as_flags("config=defaults", *OVERRIDES, *LINEAGE)
-    flags.append("--population.max_gaussians=420")
-    assert main(["gate", "fit", str(lineage_run / "run"), "--out", gate]) == 0
-    assert main(["train", "--data", capture, "--out", limited, *flags]) == 0
+    flags = as_flags("config=defaults", *OVERRIDES, *LINEAGE, "population.max_gaussians=420")
+    assert main(["train", "--data", str(lineage_run / "capture"), "--out", limited, *flags]) == 0
     # At a rate of 0, an oracle vetoes nothing.
-    arguments = ["gate", "replay", gate, limited, "--out", str(out), "--rate", "0"]
+    arguments = ["gate", "replay", "default", limited, "--out", str(out), "--rate", "0"]
     with pytest.warns(UserWarning, match="the limit of the population held back 82% of the reference's"):
         assert main(arguments) == 0
     arms = {row["arm"]: row for row in json.loads((out / "replay.json").read_text())}
@@ -104,24 +101,23 @@ def test_two_ranks_replay_a_run_of_one_and_begin_again_together(lineage_run, tmp
     assert first[1][1] < first[0][1]
 
 
-def test_a_replay_does_not_begin_where_another_one_is_training(lineage_run, tmp_path, monkeypatch, capsys):
+def test_a_replay_does_not_begin_where_another_one_is_training(lineage_run, tmp_path, monkeypatch, failure):
     monkeypatch.setattr(folder_checks, "LOCK_SECONDS", 0.1)
     out = tmp_path / "replay"
-    arguments = ["gate", "replay", "default", str(lineage_run / "run"), "--out", str(out)]
     with folder_checks.locked(out / "reference", Ranks()):
         (out / "reference" / "replay_begun").touch()
-        assert main(arguments) == 1
-    assert "is in use by another run" in capsys.readouterr().err
+        error = failure("gate", "replay", "default", lineage_run / "run", "--out", out)
+    assert "is in use by another run" in error
     assert not (out / "reference" / "checkpoints").exists()
 
 
 @pytest.mark.parametrize("name", ["reference", "oracle", "gate", "random"])
-def test_a_replay_leaves_runs_with_the_names_of_its_arms_alone(lineage_run, tmp_path, capsys, name):
+def test_a_replay_leaves_runs_with_the_names_of_its_arms_alone(lineage_run, tmp_path, failure, name):
     """For example `gate`: the folder of a training with a gate, beside the run that is replayed."""
     run = shutil.copytree(lineage_run / "run", tmp_path / name)
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
-    assert main(["gate", "replay", "default", str(lineage_run / "run"), "--out", str(tmp_path)]) == 1
-    assert "choose another --out" in capsys.readouterr().err
+    error = failure("gate", "replay", "default", lineage_run / "run", "--out", tmp_path)
+    assert "choose another --out" in error
     assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
@@ -133,32 +129,26 @@ def test_a_damaged_checkpoint_is_named(lineage_run, tmp_path):
     refused(ValueError, f"{manifest} is damaged", branch_point, run, tiny_config(*LINEAGE))
 
 
-def test_a_run_without_a_view_to_measure_is_not_replayed(lineage_run, tmp_path, capsys):
-    capture, gate = shutil.copytree(lineage_run / "capture", tmp_path / "capture"), str(tmp_path / "g.json")
-    (capture / "masks").mkdir()
-    cv2.imwrite(str(capture / "masks" / "00.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
-    run, out = str(lineage_run / "run"), tmp_path / "out"
-    assert main(["gate", "fit", run, "--out", gate]) == 0
-    assert main(["gate", "replay", gate, run, "--data", str(capture), "--out", str(out)]) == 1
-    assert "its arms could not be compared, because the views" in capsys.readouterr().err
-    assert not out.exists()
+def test_a_run_without_a_view_to_measure_is_not_replayed(lineage_run, tmp_path, failure):
+    capture, run = shutil.copytree(lineage_run / "capture", tmp_path / "capture"), lineage_run / "run"
+    write_image(capture / "masks" / "00.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    error = failure("gate", "replay", "default", run, "--data", capture, "--out", tmp_path / "out")
+    assert "its arms could not be compared, because the views" in error
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("resident_gb", [0.0, 0.5])
-def test_the_ranks_of_a_replay_can_send_tables_that_are_on_the_host(
-    lineage_run, tmp_path, monkeypatch, resident_gb
-):
-    run, gate, asked = tmp_path / "run", str(tmp_path / "g.json"), {}
+def test_the_ranks_of_a_replay_can_send_tables_that_are_on_the_host(tmp_path, monkeypatch, resident_gb):
+    run, asked = tmp_path / "run", {}
 
     def joined(*_, **options):
         asked.update(options)
         raise ValueError("joined")
 
-    assert main(["gate", "fit", str(lineage_run / "run"), "--out", gate]) == 0
     run.mkdir()
     save_config(tiny_config(f"memory.resident_gb={resident_gb}"), run / "config.yaml")
     monkeypatch.setattr(Ranks, "from_environment", joined)
-    assert main(["gate", "replay", gate, str(run), "--out", str(tmp_path / "out")]) == 1
+    assert main(["gate", "replay", "default", str(run), "--out", str(tmp_path / "out")]) == 1
     assert asked["tables_on_host"] == (resident_gb > 0)
 
 

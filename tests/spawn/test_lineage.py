@@ -19,7 +19,7 @@ from blitzgs.spawn.lineage import Births, Cause, Ledger, Lineage, LineageError, 
 from blitzgs.spawn.lineage_parts import PART_NAME, read_lineage
 from blitzgs.table.placement import redistribute
 from tests.distributed.rank_harness import run_ranks
-from tests.helpers import needs_cuda, refused
+from tests.helpers import refused
 from tests.population.test_density import random_table
 
 pytest.importorskip("pyarrow")
@@ -309,7 +309,6 @@ def test_a_full_disk_keeps_rows_and_sums_for_the_next_check(tmp_path, world_size
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_rows_leave_the_gpu_without_keeping_the_host(tmp_path, monkeypatch):
     monkeypatch.setattr(lineage_parts, "_STAGING_BYTES", 1000)
     device = torch.device("cuda", torch.cuda.current_device())

@@ -26,7 +26,7 @@ from blitzgs.spawn.gate import (
     veto_lowest,
 )
 from tests.distributed.rank_harness import run_ranks
-from tests.helpers import DEVICES, refused
+from tests.helpers import refused
 
 xgboost = pytest.importorskip("xgboost")
 SCHEDULE = {"schedule.iterations": 100}
@@ -67,7 +67,6 @@ def test_a_gate_transfers_to_scenes_it_has_not_seen(gate):
     assert info["auc"] == figures and info["schedule"] == SCHEDULE
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_trees_are_those_of_xgboost(gate, device):
     path, _ = gate
     booster = xgboost.Booster(model_file=str(path))

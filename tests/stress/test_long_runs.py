@@ -31,7 +31,6 @@ from blitzgs.runs import trained_model
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.view.views import Space, ViewSet
 from tests.distributed.rank_harness import CONTEXT
-from tests.helpers import needs_cuda
 from tests.training.tiny import (
     OVERRIDES,
     Camera,
@@ -295,7 +294,7 @@ def start_trainer(folder, device, steps):
 
 @pytest.mark.parametrize(
     ("device", "steps"),
-    [("cpu", 1000), pytest.param("cuda", 100_000, marks=[pytest.mark.slow, pytest.mark.cuda, needs_cuda])],
+    [("cpu", 1000), pytest.param("cuda", 100_000, marks=[pytest.mark.slow, pytest.mark.cuda])],
 )
 @torch.no_grad()
 def test_a_long_run_stays_with_dense_adam_and_needs_no_more_memory(tmp_path, device, steps):

@@ -206,7 +206,6 @@ def require_finite_and_correct(
         assert relative_error(actual, expected) <= gradient_bound, name
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", SCENES)
 def test_extremes(name, backend):
     require_finite_and_correct(
@@ -214,7 +213,6 @@ def test_extremes(name, backend):
     )
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("pixels", [30.0, 300.0, 3000.0])
 def test_antialiased_splats_much_wider_than_the_blur(pixels, backend):
     """The compensation of such splats is nearly 1, and its derivative far below that of its parts."""
@@ -249,7 +247,6 @@ def test_extremes_as_they_are_trained(name, backend):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("make_scene", [lambda: one_tile(1_000_000), lambda: deep(100_000)])
 def test_a_million_on_one_tile_and_a_hundred_thousand_layers(make_scene, backend):
     require_finite_and_correct(make_scene(), backend)

@@ -10,7 +10,7 @@ from blitzgs.ops.project import project
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Views
 from blitzgs.table.blocks import BlockIndex, morton_order
 from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
-from tests.helpers import DEVICES, refused
+from tests.helpers import refused
 from tests.training.tiny import caught_up, schedule_of, step_some
 
 WIDTH, HEIGHT, NEAR, FAR = 160, 120, 0.2, 60.0
@@ -64,7 +64,6 @@ def active_of(index, table, viewmats, Ks):
     return index.active(table, Views(viewmats, Ks, WIDTH, HEIGHT), (NEAR, FAR, 0.3)).listed()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("seed", range(4))
 def test_no_visible_row_is_missed_and_most_others_are_dropped(device, seed):
     table = make_table(device=device, seed=seed)
@@ -78,7 +77,6 @@ def test_no_visible_row_is_missed_and_most_others_are_dropped(device, seed):
     assert (ids[1:] > ids[:-1]).all() and active[0].dtype == active[1].dtype == torch.int32
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("n", [3000, 60_000])
 def test_the_set_does_not_depend_on_the_order_of_the_rows(device, n):
     table = make_table(n, device)
@@ -90,7 +88,6 @@ def test_the_set_does_not_depend_on_the_order_of_the_rows(device, n):
     assert {(int(table["id"][row]), view) for row, view in shuffled} == persistent
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_rows_of_culled_blocks_are_not_read(device):
     """Rows of blocks behind the camera are not read; their values do not matter until bounds are updated."""
     table = make_table(12_000, device)
@@ -122,7 +119,6 @@ def cull(index, table, views):
     return cull_blocks(*rows, Views(*views, WIDTH, HEIGHT), (NEAR, 100.0, 0.3)).listed()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_rows_of_blocks_inside_all_views_that_see_them_are_not_read(device):
     table = make_table(30_000, device)
     views = looking_down(device)
@@ -139,7 +135,6 @@ def test_rows_of_blocks_inside_all_views_that_see_them_are_not_read(device):
     assert torch.equal(before[0], after[0]) and torch.equal(before[1], after[1])
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_row_that_is_not_finite_is_not_seen_amidst_a_view(device):
     table = make_table(30_000, device)
     views = looking_down(device)
@@ -167,7 +162,6 @@ def caught_up_and_projected(table, ids, views, count, viewmats, Ks):
     return [*after.values(), *splats._replace(counts=totals)]
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("n", [0, 1, 5000, 150_000])
 @pytest.mark.parametrize("ahead", [True, False])
 def test_the_active_set_is_used_with_its_count_on_the_device(device, n, ahead):
@@ -191,7 +185,6 @@ def test_the_active_set_is_used_with_its_count_on_the_device(device, n, ahead):
         assert torch.equal(a.view(torch.uint8), b.view(torch.uint8))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("n", [1, 5000, 150_000])
 def test_too_small_a_capacity_gives_empty_lists_and_the_needed_number_of_blocks(device, n):
     table = make_table(max(n, 300), device)
@@ -214,7 +207,6 @@ def test_too_small_a_capacity_gives_empty_lists_and_the_needed_number_of_blocks(
         assert int(active.considered()) == int((active.listed()[1] != 0).sum())
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_the_active_set_covers_thousands_of_pending_steps(device):
     """Only rows of the set are caught up and stepped; dense Adam decides which rows are visible."""
     steps = 2000
@@ -241,7 +233,6 @@ def test_the_active_set_covers_thousands_of_pending_steps(device):
     assert int(table["last_step"].min()) < steps - 20
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_bounds_follow_the_rows_that_were_stepped(device):
     table = make_table(device=device)
     index = BlockIndex(table)
@@ -257,7 +248,6 @@ def test_bounds_follow_the_rows_that_were_stepped(device):
     assert set(moved.tolist()) <= set(active_of(index, table, viewmats, Ks)[0].tolist())
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_no_rows_stepped_leave_all_bounds_alone(device):
     table = make_table(device=device)
     index = BlockIndex(table)
@@ -267,7 +257,6 @@ def test_no_rows_stepped_leave_all_bounds_alone(device):
     assert torch.equal(index.bounds, before)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_morton_order_keeps_neighbours_together(device):
     points = torch.rand(4096, 3, generator=torch.Generator().manual_seed(0)).to(device)
     points[3] = math.nan
@@ -282,7 +271,6 @@ def test_morton_order_keeps_neighbours_together(device):
     assert morton_keys(points)[3] == 2**63 - 1
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_points_far_away_leave_the_morton_order_of_the_others(device):
     points = torch.randn(500, 3, generator=torch.Generator().manual_seed(0)).to(device)
     assert torch.equal(morton_order(points), morton_keys(points).sort(stable=True).indices)
@@ -296,7 +284,6 @@ def test_points_far_away_leave_the_morton_order_of_the_others(device):
     assert torch.equal(morton_order(far.cpu()), order.cpu())
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_morton_order_without_a_span_is_that_of_the_keys(device):
     """Most points lie in one place, or few are finite."""
     points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)).to(device)
@@ -312,7 +299,6 @@ def test_a_morton_order_needs_points():
     assert morton_order(torch.zeros(5, 3, requires_grad=True)).tolist() == list(range(5))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("n", [0, 1, 256, 257])
 def test_odd_sizes(device, n):
     table = make_table(3000, device)
@@ -332,7 +318,6 @@ def test_errors_name_the_value():
     refused(RuntimeError, r"bounds must .* \[1, 8\], got \[12, 8\]", active_of, index, table, *make_views(1))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_opcheck(device):
     table = make_table(600, device)
     viewmats, Ks = make_views(2, device)

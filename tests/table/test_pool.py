@@ -16,7 +16,7 @@ from blitzgs.table.blocks import BlockIndex, BlockVisibility, Cameras, culled_bl
 from blitzgs.table.host_table import HostMemoryError, HostTable
 from blitzgs.table.pool import Moved, Pool, PoolError
 from blitzgs.table.table import GaussianTable
-from tests.helpers import DEVICES, refused
+from tests.helpers import refused
 from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views
 from tests.table.test_table import append
 
@@ -58,7 +58,6 @@ def active_rows(index, table, camera):
     return found.listed()[0]
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("slots", [40, 50, 65])
 def test_steps_change_the_rows_that_they_would_change_in_the_whole_table(device, slots):
     """Steps that move all rows of their views, through a pool and in the table itself."""
@@ -86,7 +85,6 @@ def test_steps_change_the_rows_that_they_would_change_in_the_whole_table(device,
     assert pool.moved == moved
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("n", [20_000, 20_480, 100])
 def test_all_rows_pass_through_the_pool(device, n):
     table, pool = make_pool(n, slots=9, device=device)

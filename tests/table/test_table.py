@@ -9,7 +9,7 @@ from blitzgs.table.blocks import BlockIndex, morton_order, spread
 from blitzgs.table.host_table import HostTable
 from blitzgs.table.placement import place
 from blitzgs.table.table import PARAMETERS, REQUIRED, ZERO_AT_BIRTH, GaussianTable, Placement, schema
-from tests.helpers import DEVICES, refused
+from tests.helpers import refused
 
 
 def filled_table(count: int, seed: int = 0) -> GaussianTable:
@@ -196,7 +196,6 @@ def in_place(gone, beside):
     return found
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(
     ("count", "leaving", "joining"),
     [(5000, 300, 700), (5000, 300, 300), (5000, 900, 40), (5000, 0, 300), (5000, 300, 0), (700, 700, 3),

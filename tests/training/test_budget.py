@@ -304,8 +304,3 @@ def test_an_extension_that_was_killed_before_its_first_checkpoint_can_be_repeate
     train(tmp_path)
     extend(tmp_path, 1.4).close()  # its configuration is written, its checkpoint is not
     assert extend(tmp_path, 1.4).train()["images"] == 140
-
-
-def test_there_must_be_a_run(tmp_path):
-    with pytest.raises(FileNotFoundError, match="has no checkpoint: there is no finished run to extend"):
-        Trainer(tiny_config(), *tiny_scene(), tmp_path, Ranks(), resume=True, extend=2.0)

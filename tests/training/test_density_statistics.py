@@ -9,16 +9,11 @@ import pytest
 import torch
 
 from blitzgs.config.files import ConfigError
-from blitzgs.frame.render import render_frame
 from blitzgs.ops.photometric import photometric_loss
-from blitzgs.ops.projection_types import Views
 from blitzgs.reference import render
-from blitzgs.table.table import GaussianTable
 from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import run_ranks
 from tests.training import tiny
-from tests.training.test_offload import assert_same_run
-from tests.training.test_offload import train as train_street
 from tests.training.tiny import (
     HEIGHT,
     WIDTH,
@@ -30,13 +25,11 @@ from tests.training.tiny import (
     trained_in_parts,
 )
 
-STATISTICS = ("grad_sum", "grad_count", "max_radii")
 # No event changes the Gaussians within the steps of a test; statistics are gathered.
 QUIET = (
     "schedule.iterations=200", "schedule.densify_from=150", "schedule.densify_until=180",
     "schedule.sh_every=2", "model.antialiased=true",
 )  # fmt: skip
-STILL = [f"optimiser.{name}=0" for name in ("position", "sh_dc", "opacity", "scale", "rotation")]
 
 
 def make_trainer(folder, *overrides) -> Trainer:
@@ -48,13 +41,6 @@ def make_trainer(folder, *overrides) -> Trainer:
     trainer = tiny.make_trainer(folder, *QUIET, *overrides, scene=(scene, images))
     trainer.state.start_clock()
     return trainer
-
-
-def take_steps(trainer: Trainer, count: int) -> None:
-    """Take the next steps without events."""
-    with torch.no_grad():
-        for _ in range(count):
-            trainer.step(trainer.state.progress.step + 1)
 
 
 def of_one_view(trainer: Trainer, index: int, sh_degree: int, reduction: int) -> tuple[torch.Tensor, ...]:
@@ -107,7 +93,8 @@ def test_statistics_are_those_of_autograd(tmp_path, batch_size, resolution):
     trainer.loader.get = lambda *step: batches.append(get(*step)) or batches[-1]
     for step in range(steps):
         before = {name: table[name].clone() for name in table}
-        take_steps(trainer, 1)
+        with torch.no_grad():
+            trainer.step(step + 1)
         after = {name: table[name].clone() for name in table}
         for name in table:  # the values that the step read
             table[name].copy_(before[name])
@@ -133,24 +120,6 @@ def test_statistics_are_those_of_autograd(tmp_path, batch_size, resolution):
     trainer.close()
 
 
-@pytest.mark.parametrize("batch_size", [2, 4, 8])
-def test_statistics_do_not_depend_on_the_batch_size(tmp_path, batch_size):
-    """The gradients of each view's own loss are added up. The Gaussians do not move."""
-    tables = {}
-    for size in (1, batch_size):
-        trainer = make_trainer(tmp_path / str(size), f"schedule.batch_size={size}", *STILL)
-        # Two epochs over all views, with SH degrees that do not depend on the batch size.
-        trainer.state.schedule.sh_degree = lambda begin, limit: limit
-        take_steps(trainer, 16 // size)
-        tables[size] = trainer.state.table
-        trainer.close()
-    one, several = tables[1], tables[batch_size]
-    assert torch.equal(one["means"], several["means"]) and one["grad_sum"].max() > 0
-    assert torch.equal(one["grad_count"], several["grad_count"])
-    assert torch.equal(one["max_radii"], several["max_radii"])
-    torch.testing.assert_close(one["grad_sum"], several["grad_sum"], rtol=1e-5, atol=1e-9)
-
-
 RISING = ("schedule.resolution=[[2, 40]]", "schedule.iterations=60")
 
 
@@ -170,41 +139,11 @@ def test_the_log_tells_the_resolution_and_the_measurements_have_all_of_it(whole_
     assert list(steps_of(folder)) and trainer.loader.views_masked[1] == 7
 
 
-def test_a_step_renders_the_camera_of_the_reduced_photograph(tmp_path):
-    trainer = tiny.make_trainer(tmp_path, *RISING)
-    state, frames = trainer.state, []
-    forward = state.stepper.forward
-
-    def kept(*args, **named):
-        frames.append(forward(*args, **named)[0])
-        return forward(*args, **named)
-
-    state.stepper.forward = kept
-    untrained = GaussianTable({name: state.table[name].clone() for name in state.table})
-    state.start_clock()
-    take_steps(trainer, 1)
-    trainer.close()
-    (frame,), (view,) = frames, state.sampler.batch(0)
-    index = state.capture.train[view]
-    K = torch.from_numpy(state.capture.cameras[index].K).float()
-    K[:2] *= 0.5
-    views = Views(state.views.pick([index]).viewmats, K[None], WIDTH // 2, HEIGHT // 2)
-    expected = render_frame(untrained, views, frame.options).renders
-    assert torch.equal(frame.renders, expected) and expected.std() > 0.05
-
-
 def test_a_run_resumes_exactly_while_its_resolution_is_lower(whole_run, tmp_path):
     _, whole, _ = whole_run
     resumed = trained_in_parts(train, tmp_path, 30, *RISING)
     assert_same_table(resumed.state.table, whole.state.table)
     assert [event["t"] for event in events_of(tmp_path, "resolution")] == [0, 40]
-
-
-def test_gaussians_in_host_memory_are_those_that_the_lower_resolution_sees(tmp_path):
-    options = ("schedule.resolution=[[2, 30]]", "schedule.iterations=45", "lod.visible_threshold=0")
-    whole, _ = train_street(tmp_path / "whole", *options)
-    pooled, _ = train_street(tmp_path / "pooled", *options, "memory.resident_gb=0.0078")
-    assert_same_run(pooled, whole)
 
 
 def _train(ranks, folder):

@@ -39,7 +39,6 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.trainer import Trainer
 from tests.capture.helpers import ROOT, shared_data
-from tests.helpers import needs_cuda
 from tests.training.tiny import events_of, read_log, steps_of, tiny_config, tiny_scene
 
 GOLDEN = Path(__file__).with_name("golden.json")
@@ -69,12 +68,7 @@ def train(config: dict[str, Any], folder: Path, jitter: float = 0.0) -> Curves:
     generator = torch.Generator().manual_seed(1)
     for values in trainer.state.table.parameters:
         values *= 1 + jitter * torch.randn(values.shape, generator=generator)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        summary = trainer.train()
-    finally:
-        torch.set_num_threads(threads)
+    summary = trainer.train()
     assert summary is not None
     steps, densified = steps_of(folder), events_of(folder, "densify")
     return {
@@ -159,6 +153,7 @@ def spread(found: Curves, other: Curves) -> str:
 def write(path: Path) -> None:
     """Write golden.json, and print the differences that rounding causes."""
     config = to_dict(tiny_config(*OVERRIDES))
+    torch.set_num_threads(1)  # as in the tests
     with tempfile.TemporaryDirectory() as folder:
         curves = train(config, Path(folder) / "golden")
         for seed, jitter in enumerate((1e-7, 1e-6, 1e-5)):
@@ -198,10 +193,7 @@ def train_capture(device: str, capture: str, seed: int, folder: Path) -> dict[st
 @pytest.mark.skipif(shared_data() is None, reason="the real captures are not here")
 @pytest.mark.parametrize(
     "device, capture",
-    [
-        pytest.param(*case, marks=[pytest.mark.cuda, needs_cuda] if case[0] == "cuda" else [])
-        for case in CASES
-    ],
+    [pytest.param(*case, marks=pytest.mark.cuda if case[0] == "cuda" else []) for case in CASES],
 )
 def test_quality_stays_in_its_band(golden, device, capture, tmp_path):
     centre = golden["captures"].get(f"{device} {capture}")

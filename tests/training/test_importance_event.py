@@ -86,14 +86,6 @@ def test_how_many_gaussians_the_importance_passes_keep(whole_run):
     }  # fmt: skip
 
 
-def test_a_pass_says_how_many_views_are_done(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(progress, "LINE_SECONDS", 0.0)
-    train(tmp_path)
-    shown = capsys.readouterr().out
-    views = len(tiny_scene()[0].train)
-    assert shown.count(f"{views} of {views} views surveyed") == 2
-
-
 def test_the_population_is_reported(whole_run):
     folder, trainer, summary = whole_run
     report, milestones = summary["population"], trainer.state.progress.milestones
@@ -114,16 +106,6 @@ def test_the_population_is_reported(whole_run):
     # Smaller y is higher in the chart. The first pass makes the population fall at one time, from 40's peak.
     (x1, top), (x2, low) = points[3:5]
     assert x1 == x2 and low > top
-
-
-def test_ablations_keep_the_signals(tmp_path):
-    trainer, _ = train(tmp_path / "a", "population.pass1_keep=1", "population.pass2_mass=1")
-    events = pass_events(tmp_path / "a")
-    for name in ("pass_1", "pass_2"):
-        assert events[name]["gaussians"] == events[name]["before"]
-    assert PHI in trainer.state.table
-    off, _ = train(tmp_path / "b", "population.importance=false")
-    assert PHI not in off.state.table and not pass_events(tmp_path / "b")
 
 
 RELOCATION = ("population.strategy=relocation", "population.pass1_keep=1")
@@ -148,20 +130,16 @@ def test_views_are_surveyed_only_for_what_is_used(tmp_path, flags, views):
     assert trainer.state.progress.milestones["after_pass_2"] == events[1]["gaussians"]
 
 
-def test_the_second_pass_keeps_at_most_a_share(tmp_path):
+def test_a_pass_says_what_it_keeps_and_how_many_views_are_done(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(progress, "LINE_SECONDS", 0.0)
     flags = ("population.pass1_keep=1", "population.pass2_mass=1", "population.pass2_keep=0.5")
-    train(tmp_path, *flags, "population.min_opacity=1e-6")
-    second = pass_events(tmp_path)["pass_2"]
-    assert second["gaussians"] == second["before"] // 2
-
-
-def test_a_pass_says_what_it_keeps(tmp_path, capsys):
-    flags = ("population.pass1_keep=1", "population.pass2_mass=1", "population.pass2_keep=0.5")
-    train(tmp_path / "half", *flags)
+    train(tmp_path / "half", *flags, "population.min_opacity=1e-6")
     second = pass_events(tmp_path / "half")["pass_2"]
+    assert second["gaussians"] == second["before"] // 2
     kept = f"the importance pass keeps {second['gaussians']:,} of {second['before']:,} Gaussians"
     out = capsys.readouterr().out
     assert kept in out and out.count("the importance pass") == 1
+    assert out.count("7 of 7 views surveyed") == 2
     train(tmp_path / "few", *flags, "population.pass2_views=8")
     few = "keeps all Gaussians: 7 training views are fewer than population.pass2_views (8)"
     assert few in capsys.readouterr().out

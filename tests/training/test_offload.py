@@ -14,7 +14,7 @@ from blitzgs.table.pool import Pool, PoolError
 from blitzgs.table.table import GaussianTable
 from blitzgs.view.visible import VisibleFinder
 from tests.distributed.rank_harness import run_ranks
-from tests.helpers import DEVICES, refused
+from tests.helpers import refused
 from tests.training import tiny
 from tests.training.tiny import (
     HEIGHT,
@@ -56,8 +56,8 @@ def make_trainer(folder, *overrides, **how):
 
 
 def train(folder, *overrides, device="cpu", resume=False):
-    trainer = make_trainer(folder, *overrides, ranks=Ranks(device=torch.device(device)), resume=resume)
-    return trainer, trainer.train()
+    ranks = Ranks(device=torch.device(device))
+    return tiny.train(folder, *SETTINGS, *overrides, scene=street(), ranks=ranks, resume=resume)
 
 
 def assert_same_run(one, other):
@@ -68,6 +68,7 @@ def assert_same_run(one, other):
 VARIANTS = {
     "plain": (),
     "batches": ("schedule.batch_size=2", "memory.resident_gb=0.0118"),
+    "resolution": ("schedule.resolution=[[2, 40]]",),
     "passes": (
         "population.importance=true", "schedule.t1=30", "schedule.t2=48", "view.cull=true", "view.lod=true",
         "schedule.densify_until=40", "schedule.evaluate_every=25", "schedule.checkpoint_every=35",
@@ -81,7 +82,6 @@ VARIANTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_a_run_with_a_quarter_of_its_blocks_on_the_device_is_the_same_run(tmp_path, variant, device):
     options = (*VARIANTS[variant], "model.deterministic=true")
@@ -128,17 +128,6 @@ def test_a_tour_moves_less_and_shows_the_same_views(tmp_path):
 def test_a_tour_goes_on_where_it_was_interrupted(tmp_path):
     whole, _ = train(tmp_path / "whole", *TOUR)
     assert_same_run(trained_in_parts(train, tmp_path / "cut", 23, *TOUR), whole)
-
-
-def _drawn(ranks, folder):
-    trainer = make_trainer(folder, *TOUR, ranks=ranks)
-    return [trainer.state.sampler.batch(step) for step in range(60)]
-
-
-@pytest.mark.slow
-def test_a_tour_is_the_same_on_every_rank_of_any_number(tmp_path):
-    alone = _drawn(Ranks(), tmp_path / "alone")
-    assert run_ranks(_drawn, 2, tmp_path / "two") == [alone, alone]
 
 
 def _train(ranks, folder, overrides):
@@ -199,26 +188,26 @@ def test_a_batch_that_does_not_fit_is_named(tmp_path):
     assert not list((tmp_path / run_files.CHECKPOINTS).iterdir())
 
 
-def test_a_model_that_outgrows_its_pool_is_saved_and_goes_on_with_a_larger_one(tmp_path):
-    growing = ("population.grad_threshold=1e-6", "schedule.densify_until=60")
-    whole, _ = train(tmp_path / "whole", *growing)
-    with pytest.raises(PoolError, match=r"The model so far is saved: continue with --resume"):
-        train(tmp_path / "pooled", *growing, "memory.resident_gb=0.0048")
-    with pytest.raises(PoolError, match=r"lower schedule.batch_size$"):  # nothing new to save
-        train(tmp_path / "pooled", *growing, "memory.resident_gb=0.0048", resume=True)
-    larger, _ = train(tmp_path / "pooled", *growing, "memory.resident_gb=0.1", resume=True)
-    assert larger.state.origin.startswith("resumed") and "after 0 steps" not in larger.state.origin
-    assert_same_run(larger, whole)
-
-
-def test_a_pass_that_does_not_fit_costs_nothing_and_happens_with_a_larger_pool(tmp_path):
-    # The first step fits into the pool, and the pass behind it surveys views that see more blocks.
-    options = ("schedule.iterations=20", "population.importance=true", "schedule.t1=1", "schedule.t2=0")
+@pytest.mark.parametrize(
+    ("options", "resumed"),
+    [
+        (("population.grad_threshold=1e-6", "schedule.densify_until=60"), "resumed from"),
+        # The first step fits into the pool, and the pass behind it surveys views that see more blocks.
+        (
+            ("schedule.iterations=20", "population.importance=true", "schedule.t1=1", "schedule.t2=0"),
+            "after 2 steps",
+        ),
+    ],
+    ids=["step", "pass"],
+)
+def test_what_outgrows_its_pool_costs_nothing_and_happens_with_a_larger_one(tmp_path, options, resumed):
     whole, _ = train(tmp_path / "whole", *options)
-    with pytest.raises(PoolError, match=r"The model so far is saved: continue with --resume"):
-        train(tmp_path / "pooled", *options, "memory.resident_gb=0.0048")
+    small = (tmp_path / "pooled", *options, "memory.resident_gb=0.0048")
+    refused(PoolError, r"The model so far is saved: continue with --resume", train, *small)
+    if resumed == "resumed from":  # nothing new to save
+        refused(PoolError, r"lower schedule.batch_size$", train, *small, resume=True)
     larger, _ = train(tmp_path / "pooled", *options, "memory.resident_gb=0.1", resume=True)
-    assert "after 2 steps" in larger.state.origin
+    assert resumed in larger.state.origin and "after 0 steps" not in larger.state.origin
     assert_same_run(larger, whole)
 
 

@@ -14,7 +14,7 @@ from blitzgs.runs.guard import NonFiniteError
 from blitzgs.training.events import densify
 from blitzgs.training.trainer import Trainer
 from blitzgs.training.understood import small_batch_hint
-from tests.helpers import DEVICES, needs_cuda, refused
+from tests.helpers import refused
 from tests.training.tiny import (
     assert_same_table,
     events_of,
@@ -39,13 +39,11 @@ def test_training_improves_the_images(whole_run, tmp_path):
     _, start = train(tmp_path, "schedule.iterations=1")
     assert summary["psnr"] > start["psnr"] + 3
     assert summary["ssim"] > start["ssim"]
-    assert summary["gaussians"] == len(trainer.state.table)
-    assert trainer.state.progress.sh_degree == 3
-    assert trainer.state.table["birth"].max() > 0
 
 
 def test_what_a_run_leaves_behind(whole_run):
     folder, trainer, summary = whole_run
+    assert trainer.state.progress.sh_degree == 3 and trainer.state.table["birth"].max() > 0
     assert json.loads((folder / "summary.json").read_text()) == summary
     figures = ("psnr", "ssim", "seconds", "images_per_second", "peak_memory_bytes", "config_hash", "versions")
     assert all(summary[name] for name in figures)
@@ -210,7 +208,6 @@ def test_views_that_see_nothing(tmp_path):
     assert torch.equal(trainer.state.table["means"], before)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_non_finite_values_stop_the_run_by_name(tmp_path, device):
     trainer = make_trainer(tmp_path, ranks=Ranks(device=torch.device(device)))
     trainer.state.table["scales"][trainer.state.table["id"] == 7, 1] = float("nan")
@@ -235,16 +232,13 @@ def test_a_run_is_not_overwritten_nor_resumed_with_another_configuration(whole_r
     folder, *_ = whole_run
     written = (folder / "config.yaml").read_bytes()
     refused(FileExistsError, "add --resume", train, folder)
-    with pytest.raises(
-        ConfigError, match=r"loss.ssim: the checkpoint was trained with 0.2, now 0.3; leave out --config"
-    ):
-        train(folder, "loss.ssim=0.3", resume=True)
+    differs = r"loss.ssim: the checkpoint was trained with 0.2, now 0.3; leave out --config"
+    refused(ConfigError, differs, train, folder, "loss.ssim=0.3", resume=True)
     assert (folder / "config.yaml").read_bytes() == written
-    train(folder, "log.every=50", resume=True)
+    train(folder, "log.every=50", "schedule.evaluate_every=7", "schedule.checkpoint_every=9", resume=True)
 
 
 @pytest.mark.cuda
-@needs_cuda
 def test_cuda_trains_like_the_cpu_and_resumes_exactly(whole_run, tmp_path):
     ranks = Ranks(device=torch.device("cuda"))
     on_gpu = partial(train, ranks=ranks)

@@ -2,7 +2,6 @@
 """What `train` says of a capture, memory and time before it trains, and what it refuses."""
 
 import dataclasses
-import json
 import warnings
 from types import SimpleNamespace
 from typing import ClassVar
@@ -32,6 +31,7 @@ from blitzgs.training.understood import (
     large_images_hint,
     undistortion_note,
 )
+from tests.helpers import refused
 from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, as_flags, tiny_config, write_tiny_capture
 
 FLAGS = as_flags("config=defaults", *OVERRIDES, "schedule.iterations=10")
@@ -78,12 +78,6 @@ def test_check_prints_a_block_and_stops(data, capsys, tmp_path, monkeypatch):
     assert lines["sizes"] == f"{WIDTH} x {HEIGHT} pixels" and lines["masks"] == lines["alpha"] == "none"
     assert lines["points"].startswith("400 of ") and "near plane" in lines["extent"]
     assert "Gaussians at most" in lines["training"] and "minutes" in lines["training"]
-
-
-def test_train_prints_the_block_before_it_trains(data, capsys, tmp_path):
-    assert main(["train", "--data", str(data), "--out", str(tmp_path / "run"), *FLAGS]) == 0
-    shown = capsys.readouterr().out
-    assert shown.index("photographs:") < shown.index("extent:") < shown.index("new run")
 
 
 def test_what_was_left_out_is_in_the_block(data, capsys):
@@ -161,41 +155,37 @@ def test_points_of_another_world_stop_the_run(data, capsys, tmp_path):
 def test_views_that_see_no_random_point_ask_for_points():
     """As in a flight that looks straight down: parallel views do not meet anywhere."""
     about = SimpleNamespace(blind=3, random_points=True)
-    with pytest.raises(
-        HopelessCaptureError, match="site has no points, .* put the points of the reconstruct"
-    ):
-        check_worlds(SimpleNamespace(cameras=[None] * 3, about=about, root="site"))
+    capture = SimpleNamespace(cameras=[None] * 3, about=about, root="site")
+    refused(HopelessCaptureError, "site has no points, .* put the points of the rec", check_worlds, capture)
 
 
-def test_a_run_keeps_its_near_plane(data, tmp_path, capsys):
-    out = tmp_path / "run"
-    assert main(["train", "--data", str(data), "--out", str(out), *FLAGS]) == 0
-    text = (out / "config.yaml").read_text()
-    near = float(next(line for line in text.splitlines() if line.strip().startswith("near:")).split(":")[1])
-    assert 0 < near <= 0.01
-    cameras = json.loads((out / "cameras.json").read_text())
-    assert len(cameras["cameras"]) == 8
+def test_train_prints_the_block_before_it_trains_and_keeps_its_near_plane(data, capsys, tmp_path):
+    assert main(["train", "--data", str(data), "--out", str(tmp_path / "run"), *FLAGS]) == 0
+    shown = capsys.readouterr().out
+    assert shown.index("photographs:") < shown.index("extent:") < shown.index("new run")
+    assert 0 < load_config(tmp_path / "run" / "config.yaml").model.near <= 0.01
 
 
 @pytest.mark.parametrize(
     ("limit", "cache_bytes", "budget"),
-    [("1000000\n", 800_000, 250_000), ("1000000\n", 300_000, 150_000), ("max\n", 300_000, 150_000)],
+    [
+        ("1000000\n", 800_000, 250_000),
+        ("1000000\n", 300_000, 150_000),
+        ("max\n", 300_000, 150_000),
+        (None, 10**9, 4096 * 250 // 2),
+    ],
 )
-def test_ranks_share_at_most_half_of_the_memory_of_a_container(
+def test_ranks_share_at_most_half_of_the_memory_of_a_container_or_host(
     capture, tmp_path, monkeypatch, limit, cache_bytes, budget
 ):
-    (tmp_path / "memory.max").write_text(limit)
+    if limit is not None:
+        (tmp_path / "memory.max").write_text(limit)
     monkeypatch.setattr(inputs, "_CONTAINER_LIMIT", tmp_path / "memory.max")
+    pages = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 500 if limit is None else 10**6}
+    monkeypatch.setattr(inputs.os, "sysconf", pages.__getitem__)
     config = tiny_config(f"data.path={capture}", f"data.cache_bytes={cache_bytes}")
     _, images = inputs.open_capture(config, Ranks(local_world_size=2))
     assert images.compressed.budget == budget and images.decoded.budget == budget // 4 + budget
-
-
-def test_without_a_container_the_memory_of_the_host_counts(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(inputs, "_CONTAINER_LIMIT", tmp_path / "missing")
-    monkeypatch.setattr(inputs.os, "sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 100}[name])
-    _, images = inputs.open_capture(tiny_config(f"data.path={capture}"), Ranks())
-    assert images.compressed.budget == 4096 * 50
 
 
 def test_ranks_whose_photographs_do_not_fit_get_a_hint(loaded, monkeypatch):
@@ -276,7 +266,7 @@ def config_of(*overrides):
     return load_config(None, overrides)
 
 
-def test_the_memory_of_a_known_population(loaded):
+def test_the_memory_of_a_known_population_and_the_minutes(loaded):
     found = estimate(config_of("population.max_gaussians=400", "schedule.batch_size=2"), loaded, True, 2)
     row = 3 * 59 * 4 + 42 + 180 + 500  # 59 parameters with two moments, and the widest column once more
     assert found.gaussians == 400
@@ -288,12 +278,9 @@ def test_the_memory_of_a_known_population(loaded):
     on_cpu = estimate(config_of("population.max_gaussians=400", "schedule.batch_size=2"), loaded, False, 2)
     assert on_cpu.device_bytes == 0
     assert on_cpu.host_bytes == 400_000_000 + 3 * VIEWS * WIDTH * HEIGHT + found.device_bytes
-
-
-def test_minutes_are_those_that_were_asked_for(loaded):
+    minutes = [estimate(config_of(), loaded, False, cores).minutes for cores in (1, 4)]
+    assert minutes[0] == pytest.approx(4 * minutes[1])
     assert estimate(config_of("schedule.minutes=7"), loaded, False, 2).minutes == 7
-    one, four = (estimate(config_of(), loaded, False, cores).minutes for cores in (1, 4))
-    assert one == pytest.approx(4 * four)
 
 
 def test_growth_ends_at_the_limit_and_its_mean_is_over_images():

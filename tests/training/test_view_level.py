@@ -17,6 +17,7 @@ from blitzgs.frame.render import render_frame
 from blitzgs.population.importance import is_culled
 from blitzgs.runs import trained_model
 from blitzgs.runs.evaluation import image_metrics
+from blitzgs.runs.world import subject_of_file
 from blitzgs.table.table import CULL, GaussianTable
 from blitzgs.training import view_level
 from blitzgs.training.events import evaluate
@@ -25,8 +26,6 @@ from blitzgs.view.gate import centres_of
 from tests.distributed.rank_harness import on_each_device, run_ranks
 from tests.training import tiny
 from tests.training.tiny import (
-    OVERRIDES,
-    as_flags,
     assert_same_table,
     events_of,
     lose_view,
@@ -35,7 +34,6 @@ from tests.training.tiny import (
     stop_at,
     tiny_scene,
     trained_in_parts,
-    write_tiny_capture,
 )
 
 # The passes follow the density event at 40 and come at 70; the window ends at 60; the mask is cleared at 85.
@@ -205,18 +203,12 @@ def test_a_run_on_two_ranks_opens_the_gate_and_clears_the_mask(whole_run, tmp_pa
         assert psnr == pytest.approx(summary["psnr"], abs=0.5)
 
 
-def test_render_honours_the_gate(tmp_path):
-    write_tiny_capture(tmp_path / "capture")
-    out, flags = tmp_path / "run", as_flags("config=defaults", *OVERRIDES, *FLAGS)
-    data = ["--data", str(tmp_path / "capture"), "--out", str(out)]
-    assert main(["train", *data, "--schedule.scale=0.8", *flags]) == 0
-    arguments = ["--out", str(tmp_path / "images"), "--raw", "--device", "cpu"]
-    assert main(["render", str(out), *arguments]) == 0
-    (path,) = (tmp_path / "images").glob("*.npy")
-    model, cameras = blitzgs.open_run(out).model(), blitzgs.open_run(out).cameras()
+def test_render_honours_the_gate(whole_run, tmp_path):
+    folder, *_ = whole_run
+    assert main(["render", str(folder), "--out", str(tmp_path), "--raw", "--device", "cpu"]) == 0
+    model = blitzgs.open_run(folder).model()
     assert model.lod is not None
-    image = model.render(cameras.cameras[cameras.test[0]])
-    np.testing.assert_allclose(np.load(path), image.numpy(), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(np.load(tmp_path / "03.npy"), model.render(3).numpy(), rtol=0, atol=1e-5)
 
 
 def test_a_gate_that_no_training_view_has_is_not_applied_elsewhere(tmp_path, monkeypatch):
@@ -249,7 +241,12 @@ def test_the_export_carries_the_levels(whole_run, tmp_path):
     words = line.split()
     distance = state.progress.reference_distance * state.space.unit
     assert float(words[words.index("reference_distance") + 1]) == distance
-    assert words[-4:] == ["levels", str(state.progress.level_count), "finest", "1"]
+    assert words[-6:-1] == ["levels", str(state.progress.level_count), "finest", "1", "least"]
+    # The views of the file have the gate that those of the run have.
+    lod = subject_of_file(found, state.config, state.space, Ranks()).lod
+    centres = torch.cat([state.views.centres(state.capture.train), torch.tensor([[0.0, 0.0, 1e5]]).double()])
+    gated = [flag == "1" for flag in state.progress.gated_views]
+    assert [lod.applies(share) for share in lod.kept(centres)] == [*gated, False]
     with pytest.raises(ValueError, match="levels has the shape"):
         write_ply(path, means=found.means, quats=found.quats, scales=found.scales,
                   opacities=found.opacities, sh=found.sh, levels=found.levels[1:])  # fmt: skip

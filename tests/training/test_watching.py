@@ -55,17 +55,14 @@ class Recorder:
         self.closed += 1
 
 
-def some_look(state, mode="RGB"):
-    camera = state.capture.cameras[0]
-    return Look(viewmat(camera, state.space), camera.K, camera.width, camera.height, mode=mode)
-
-
 STEPS = "schedule.iterations=40"
 
 
 def watched_run(folder, *overrides, ranks=None, **choices):
     trainer = make_trainer(folder, STEPS, *overrides, ranks=ranks)
-    watcher = Recorder(some_look(trainer.state), **choices)
+    camera = trainer.state.capture.cameras[0]
+    look = Look(viewmat(camera, trainer.state.space), camera.K, camera.width, camera.height)
+    watcher = Recorder(look, **choices)
     trainer.watch(watcher if ranks is None or ranks.rank == 0 else None)
     return trainer, watcher, trainer.train()
 
@@ -257,25 +254,18 @@ def test_a_lost_held_out_photograph_ends_the_glances_alone(tmp_path, monkeypatch
     assert [event["reason"] for event in events_of(tmp_path, "glance failed")] == ["03.png is gone"]
 
 
-def followed(values, curve=None):
-    curve = Curve() if curve is None else curve
-    return curve, [text for i, value in enumerate(values) if (text := curve.add(100 * (i + 1), value))]
-
-
-def test_a_fall_is_reported_once():
-    values = [20.0] * WINDOW + [25.0] * WINDOW + [25.0 - FALL - 1] * (2 * WINDOW)
-    curve, said = followed(values)
-    assert len(said) == 1 and "3." in said[0] and "25.0 dB" in said[0]
-    assert curve.fall == FALL + 1 and len(curve.warnings()) == 1
-
-
-def test_single_batches_are_no_fall_of_the_curve():
-    curve, said = followed(([25.0] * (WINDOW - 1) + [15.0]) * 4)
-    assert not said and not curve.warnings()
-
-
-def test_a_reset_begins_the_curve_anew():
-    curve, _ = followed([25.0] * WINDOW)
-    curve.restart()
-    curve, said = followed([15.0] * (2 * WINDOW), curve)
-    assert not said and curve.fall == 0
+@pytest.mark.parametrize(
+    ("values", "fall"),
+    [
+        ([20.0] * WINDOW + [25.0] * WINDOW + [25.0 - FALL - 1] * (2 * WINDOW), FALL + 1),
+        (([25.0] * (WINDOW - 1) + [15.0]) * 4, 0),  # single batches
+        ([25.0] * WINDOW + [None] + [15.0] * (2 * WINDOW), 0),  # with a reset in between
+    ],
+)
+def test_a_fall_is_reported_once(values, fall):
+    curve, said = Curve(), []
+    for number, value in enumerate(values, 1):
+        said.append(curve.restart() if value is None else curve.add(100 * number, value))
+    texts = [text for text in said if text]
+    assert curve.fall == fall and len(texts) == len(curve.warnings()) == (fall > 0)
+    assert all("fell by 3." in text and "from 25.0 dB" in text for text in texts)

@@ -52,7 +52,9 @@ class Camera:
     world_to_camera: np.ndarray
     image_path: Path = Path("/nowhere")
     mask_path: Path | None = None
-    rectification: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(has_invalid=False))
+    rectification: SimpleNamespace = field(
+        default_factory=lambda: SimpleNamespace(has_invalid=False, is_identity=True)
+    )
 
 
 @dataclass

@@ -23,7 +23,7 @@ from blitzgs.view.look import MODES, Look
 from blitzgs.view.views import render_options, viewmat
 from blitzgs.view.visible import Subject, VisibleFinder
 from tests.distributed.rank_harness import run_ranks
-from tests.helpers import DEVICES, refused
+from tests.helpers import refused
 from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, allowed, make_table, make_views, seen
 
 
@@ -84,7 +84,6 @@ def test_levels_have_colours_of_their_own(scene, drawer):
     assert np.abs(levels.astype(int) - plain).mean() > 5
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_layers_of_depth_are_one_picture(scene, trained, device, monkeypatch):
     model = open_run(trained[1]).model(device)
     subject, owners = subject_of(model), TileOwners(Ranks(device=torch.device(device)))
@@ -208,7 +207,7 @@ def test_levels_and_visible_voxels_are_those_of_all_distances(monkeypatch, pairs
     monkeypatch.setattr("blitzgs.view.levels._PAIRS", pairs)
     points, centres = flat_scene(count, cameras, seed=count)
     distances = np.linalg.norm(points.numpy()[None] - centres.numpy()[:, None], axis=2)
-    levels = measure_levels(points, centres, 2.0, 0.001)
+    levels = measure_levels(points, centres, 2.0)
     d_max = np.quantile(np.quantile(distances, 0.999, axis=1), 0.999)
     assert levels.reference_distance == pytest.approx(d_max, rel=1e-12)
     d_min = np.quantile(np.quantile(distances, 0.001, axis=1), 0.001)
@@ -223,7 +222,6 @@ LIMITS = (NEAR, FAR, 0.3)
 OPTIONS = RenderOptions(sh_degree=0, near_plane=NEAR, far_plane=FAR)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_rows_outside_the_views_are_left_out_and_the_image_stays_the_same(device):
     table, views = make_table(device=device), Views(*make_views(device=device), WIDTH, HEIGHT)
     found = VisibleFinder(table).find(views, LIMITS)
@@ -235,7 +233,6 @@ def test_rows_outside_the_views_are_left_out_and_the_image_stays_the_same(device
     assert whole.any() and torch.equal(render_frame(table, views, OPTIONS, found.active).renders, whole)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_the_gate_leaves_out_the_rows_that_it_leaves_out_of_the_whole_table(device):
     table, views = make_table(device=device), Views(*make_views(device=device), WIDTH, HEIGHT)
     table["level"] = (torch.arange(len(table), device=device) % 6).to(torch.uint8)
@@ -248,7 +245,6 @@ def test_the_gate_leaves_out_the_rows_that_it_leaves_out_of_the_whole_table(devi
     assert int(found.considered()) < int(gated.considered()) < len(table)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_table_without_rows_is_found_empty(device):
     table = make_table(device=device)
     table.keep(torch.zeros(len(table), dtype=torch.bool, device=device))

@@ -23,7 +23,7 @@ from blitzgs.training.batches import Batch
 from blitzgs.training.step import Stepper
 from blitzgs.view.gate import SAMPLE, LodGate, ModelGate, ViewGate, all_rows, centres_of
 from tests.distributed.rank_harness import on_each_device, run_ranks
-from tests.helpers import DEVICES, refused
+from tests.helpers import refused
 from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, allowed, make_table, make_views, seen
 from tests.training.tiny import caught_up, random_gaussians, schedule_of, step_some, tiny_config
 
@@ -73,7 +73,6 @@ def some_rows(table, views, seed=0):
     return ActiveRows(*(column.int().to(table.device) for column in columns))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("lod_views", [(), (0, 2, 3), (0, 1, 2, 3)])
 @pytest.mark.parametrize("columns", [(), COLUMNS])
 def test_every_set_is_that_of_the_definition(device, lod_views, columns):
@@ -97,7 +96,6 @@ def test_every_set_is_that_of_the_definition(device, lod_views, columns):
             assert 0.05 < found.sum() / before[: len(ids)].double().count_nonzero() < 2
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_level_beyond_the_finest_is_kept_nowhere_and_level_0_everywhere(device):
     table = make_scene(device=device)
     viewmats, _ = make_views(device=device)
@@ -114,7 +112,6 @@ def render(table, viewmats, Ks, active=None):
     return render_frame(table, Views(viewmats, Ks, WIDTH, HEIGHT), OPTIONS, active).renders
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_images_are_those_of_the_gaussians_that_are_kept_with_blocks_and_without(device):
     table = make_scene(5000, device)
     table["scales"].clamp_(max=0.0)
@@ -136,7 +133,6 @@ def test_images_are_those_of_the_gaussians_that_are_kept_with_blocks_and_without
     assert (images != everything).flatten(1).any(1).sum() >= 2
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("smooth", [False, True])
 def test_training_behind_the_gate_is_dense_adams(device, smooth):
     """Rows that the gate leaves out have pending steps; a training that applies all steps at once ends alike.
@@ -198,7 +194,6 @@ def test_training_behind_the_gate_is_dense_adams(device, smooth):
         torch.testing.assert_close(lazy[name], dense[name], rtol=0, atol=0.01)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_the_gated_active_set_covers_pending_steps(device):
     """Blocks and rows are dropped by where pending steps may take them; dense Adam decides what is kept."""
     steps = 400
@@ -230,7 +225,6 @@ def test_the_gated_active_set_covers_pending_steps(device):
     assert listed < 0.5 * without
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_blocks_that_a_mask_leaves_out_are_dropped_unread(device):
     """Blocks from which the mask leaves nothing out are taken whole, as without a mask."""
     table = make_scene(30_000 + 100, device)
@@ -253,7 +247,6 @@ def test_blocks_that_a_mask_leaves_out_are_dropped_unread(device):
         assert torch.equal(a, b[kept])
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("columns", [(), COLUMNS])
 def test_the_gated_set_does_not_depend_on_the_order_of_the_rows(device, columns):
     """Without pending steps, the set is the part of the ungated set that the exact test keeps."""
@@ -333,7 +326,6 @@ def test_gated_images_are_the_same_at_every_world_size(world_size, device):
         assert image.any() and torch.equal(sum(parts[k] for _, parts in answers), image)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_sweep_scores_what_the_gate_lets_views_show(device):
     table = make_scene(4000, device)
     table["scales"].clamp_(max=0.0)
@@ -377,7 +369,6 @@ def test_errors_name_the_value():
         gate_views_(active, table["means"], many, GateRules(table["level"], [1.0], 1))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_opcheck(device):
     table = make_scene(600, device)
     viewmats, _ = make_views(device=device)

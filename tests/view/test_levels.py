@@ -15,7 +15,7 @@ from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Vi
 from blitzgs.reference.render import render as reference_render
 from blitzgs.view.gate import LodGate, ModelGate, centres_of
 from blitzgs.view.levels import FOOTPRINT_LEVELS, Levels, footprint_levels, footprint_sizes, measure_levels
-from tests.helpers import DEVICES, refused
+from tests.helpers import refused
 from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_views
 from tests.view.test_gate import GATE, OPTIONS, make_scene
 
@@ -35,7 +35,7 @@ def test_matches_numpy_quantiles(fork):
     d_min = np.quantile(np.quantile(distances, 0.001, axis=1), 0.001)
     box = 1.1 * (np.quantile(points, 0.99, axis=0) - np.quantile(points, 0.01, axis=0)).max()
     count = max(1, round(math.log(d_max / d_min) / math.log(fork)) + 1)
-    levels = measure_levels(*cloud(), fork, 0.001)
+    levels = measure_levels(*cloud(), fork)
     assert levels.count == count
     assert levels.reference_distance == pytest.approx(d_max, rel=1e-12)
     assert levels.voxel_size == pytest.approx(box / fork ** (10 - count // 2 + 1), rel=1e-12)
@@ -44,8 +44,8 @@ def test_matches_numpy_quantiles(fork):
 def test_scales_with_the_world_exactly():
     points, centres = cloud()
     levels, scaled = (
-        measure_levels(points, centres, 2.0, 0.001),
-        measure_levels(points * 64, centres * 64, 2.0, 0.001),
+        measure_levels(points, centres, 2.0),
+        measure_levels(points * 64, centres * 64, 2.0),
     )
     assert scaled == Levels(levels.count, 2.0, levels.reference_distance * 64, levels.voxel_size * 64)
 
@@ -70,9 +70,9 @@ def test_farthest_is_where_eq_1_still_rounds_up_to_the_level():
 
 def test_degenerate_input_is_refused():
     points, centres = cloud(10)
-    refused(ValueError, "got 0 points and 30 cameras", measure_levels, points[:0], centres, 2.0, 0.001)
+    refused(ValueError, "got 0 points and 30 cameras", measure_levels, points[:0], centres, 2.0)
     with pytest.raises(ValueError, match="spread out, .* measures 0, .* Check the points of the capture"):
-        measure_levels(points[:1].repeat(5, 1), centres, 2.0, 0.001)
+        measure_levels(points[:1].repeat(5, 1), centres, 2.0)
 
 
 def test_levels_of_footprints_leave_out_only_what_is_too_small_and_most_of_that():
@@ -138,7 +138,6 @@ def test_the_weights_fall_over_half_a_level_around_the_cut(fork):
     assert replace(gate, smooth=False).fade() == ()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_images_are_those_of_faded_opacities(device, antialiased):
     table = faint_scene(700, device)
@@ -158,7 +157,6 @@ def test_images_are_those_of_faded_opacities(device, antialiased):
         torch.testing.assert_close(images[view].double()[sure], expected.image[sure], rtol=0, atol=2e-4)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_the_gate_before_the_projection_changes_nothing(device):
     """All Gaussians that the gate leaves out have the weight 0."""
     table = faint_scene(6000, device)
@@ -174,7 +172,6 @@ def test_the_gate_before_the_projection_changes_nothing(device):
     assert not torch.equal(faded.renders, render_frame(table, views, OPTIONS, cut).renders)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_images_change_little_where_the_gate_makes_them_jump(device):
     """One Gaussian of level 2, seen from around its cut."""
     table = faint_scene(100, device)
@@ -201,7 +198,6 @@ def test_images_change_little_where_the_gate_makes_them_jump(device):
     assert largest[True] < 0.15 * largest[False]
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_gradients_are_those_of_opacities_that_faded_before(device, antialiased):
     """The weight is a factor of the opacity's gradient, and a constant for means and poses."""
@@ -260,7 +256,6 @@ def test_errors_name_the_value():
     refused(RuntimeError, "level must be Byte, got Int", call, table["level"].int(), SMOOTH.fade())
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_opcheck(device):
     table = faint_scene(50, device)
     viewmats, Ks = make_views(2, device)

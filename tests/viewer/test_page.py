@@ -26,7 +26,7 @@ from blitzgs.viewer.paths import from_json
 from blitzgs.viewer.studio import Studio, open_model
 from blitzgs.viewer.visitor import EYE_HEIGHT
 from blitzgs.viewer.world import SCALE, looking
-from tests.browser import Browser, needs_chromium, wait_for
+from tests.browser import Browser, wait_for
 from tests.helpers import export_ply
 from tests.training.tiny import tiny_config, tiny_scene
 
@@ -90,7 +90,6 @@ def test_a_port_in_use_does_not_end_a_training(tmp_path, capsys):
     assert "training goes on without the viewer" in capsys.readouterr().out
 
 
-@needs_chromium
 def test_the_page_shows_the_model(studio, browser):
     visitor = settled(studio)
     wait_for(lambda: picture(browser).std() > 3, 60, "the picture is on the page")
@@ -103,7 +102,6 @@ def test_the_page_shows_the_model(studio, browser):
     assert browser.errors() == []
 
 
-@needs_chromium
 def test_a_drag_turns_the_camera(studio, browser):
     visitor = settled(studio)
     before, place = drawn(studio, browser), visitor.stance.position
@@ -113,7 +111,6 @@ def test_a_drag_turns_the_camera(studio, browser):
     wait_for(lambda: np.abs(picture(browser) - before).mean() > 2, 60, "another picture")
 
 
-@needs_chromium
 def test_a_control_changes_the_picture(studio, browser):
     visitor = settled(studio)
     before = drawn(studio, browser)
@@ -134,7 +131,6 @@ def test_a_control_changes_the_picture(studio, browser):
     assert browser.errors() == []
 
 
-@needs_chromium
 def test_a_click_on_a_frustum_stands_there(studio, browser):
     visitor = settled(studio)
     world, start, middle = studio.page.world, studio.page.world.start(), studio.page.world.middle
@@ -165,7 +161,6 @@ def test_a_click_on_a_frustum_stands_there(studio, browser):
     wait_for(lambda: browser.place_of(f"Standing at {name}"), 60, "the panel names the photograph")
 
 
-@needs_chromium
 def test_photograph_and_render_are_compared(studio, browser):
     visitor = settled(studio)
     visitor.stand_at(0)
@@ -185,7 +180,6 @@ def test_photograph_and_render_are_compared(studio, browser):
     visitor.change(exposure=False)
 
 
-@needs_chromium
 def test_a_path_is_saved(studio, browser):
     visitor = settled(studio)
     browser.press("Viewpoints and path")
@@ -206,7 +200,6 @@ def test_a_path_is_saved(studio, browser):
     )
 
 
-@needs_chromium
 def test_walking_is_at_eye_height(studio, browser):
     visitor = settled(studio)
     browser.press("walk")
@@ -229,7 +222,6 @@ def test_walking_is_at_eye_height(studio, browser):
     assert browser.errors() == []
 
 
-@needs_chromium
 def test_keys_move_a_visitor_who_flies(studio, browser):
     visitor = settled(studio)
     browser.press("fly")
@@ -248,7 +240,6 @@ def test_keys_move_a_visitor_who_flies(studio, browser):
     wait_for(lambda: visitor.motion == "orbit", 60, "the motion is chosen")
 
 
-@needs_chromium
 def test_a_ply_file_behind_a_token(trained, tmp_path):
     file = tmp_path / "model.ply"
     export_ply(open_run(trained[1]).model(), file)
@@ -260,7 +251,6 @@ def test_a_ply_file_behind_a_token(trained, tmp_path):
             assert browser.errors() == []
 
 
-@needs_chromium
 def test_the_live_page_follows_a_training(tmp_path, monkeypatch):
     step = Trainer.step
 
@@ -282,8 +272,8 @@ def test_the_live_page_follows_a_training(tmp_path, monkeypatch):
     live = live_page(trainer.state, 0, "127.0.0.1")
     trainer.watch(live)
     thread = threading.Thread(target=run, daemon=True)
-    thread.start()
     with Browser(live.page.url) as browser:
+        thread.start()
         wait_for(browser.figures, 60, "a picture")
         wait_for(lambda: picture(browser).std() > 3, 60, "the picture is on the page")
         first = picture(browser)

@@ -8,7 +8,7 @@ import threading
 import numpy as np
 import pytest
 
-from blitzgs.capture.world import WorldFrame, enu_frame
+from blitzgs.capture.world import WorldFrame, enu_frame, geodetic
 from blitzgs.cli import main
 from blitzgs.cli.view import tiles_server
 from blitzgs.distributed.group import Ranks
@@ -18,7 +18,7 @@ from blitzgs.formats.tiles import write_tiles
 from blitzgs.runs.folder import open_run
 from blitzgs.viewer.studio import open_model
 from blitzgs.viewer.web import open_city, to_globe
-from tests.browser import Browser, needs_chromium, wait_for
+from tests.browser import Browser, wait_for
 from tests.formats.test_tiles import SCENE, city, nodes
 from tests.helpers import read_glb, refused
 from tests.viewer.test_parts import camera_at
@@ -34,11 +34,12 @@ def shown(tmp_path_factory):
     folder, model = tmp_path_factory.mktemp("tiles"), city()
     write_tiles(folder / "city", model, np.eye(4), SCENE, "<city>", most=300)
     save_ply(folder / "city.ply", model)
-    with tiles_server(folder / "city", "127.0.0.1", 0) as server:
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
-        thread.start()
-        with Browser("about:blank", 640, 480) as browser:
-            yield folder, browser, f"http://127.0.0.1:{server.server_port}/"
+    with (
+        Browser("about:blank", 640, 480) as browser,
+        tiles_server(folder / "city", "127.0.0.1", 0) as server,
+    ):
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield folder, browser, f"http://127.0.0.1:{server.server_port}/"
         server.shutdown()
 
 
@@ -52,7 +53,6 @@ def pixels(browser):
     return np.array(values).reshape(HEIGHT, WIDTH, 4)[..., :3]
 
 
-@needs_chromium
 def test_nearer_views_load_more_tiles_and_farther_ones_show_fewer(shown):
     _, browser, url = shown
     browser.go(url)
@@ -69,7 +69,6 @@ def test_nearer_views_load_more_tiles_and_farther_ones_show_fewer(shown):
     assert browser.errors() == []
 
 
-@needs_chromium
 def test_with_all_tiles_the_picture_is_that_of_our_renderer(shown):
     folder, browser, url = shown
     browser.go(url + "?error=1e-9")
@@ -84,7 +83,6 @@ def test_with_all_tiles_the_picture_is_that_of_our_renderer(shown):
     assert np.abs(pixels(browser) - wanted).mean() < 1
 
 
-@needs_chromium
 def test_a_budget_is_kept_and_missing_tiles_are_said(shown):
     folder, browser, url = shown
     browser.go(url + "?budget=28000&error=0.01")
@@ -193,19 +191,6 @@ def test_a_file_is_written_as_tiles_and_flags_choose(tmp_path, capsys, failure):
     (tmp_path / "cut.ply").write_bytes((tmp_path / "m.ply").read_bytes()[:-100])
     assert main(["export", str(tmp_path / "cut.ply"), "--tiles", str(tmp_path / "u")]) == 1
     assert "cut.ply" in capsys.readouterr().err and not (tmp_path / "u").exists()
-
-
-def geodetic(globe):
-    """Return latitude, longitude (degrees) and height of EPSG:4978 coordinates, by iteration."""
-    x, y, z = globe
-    a, f = 6378137.0, 1 / 298.257223563
-    e2, p = f * (2 - f), np.hypot(x, y)
-    latitude = np.arctan2(z, p * (1 - e2))
-    for _ in range(10):
-        n = a / np.sqrt(1 - e2 * np.sin(latitude) ** 2)
-        height = p / np.cos(latitude) - n
-        latitude = np.arctan2(z, p * (1 - e2 * n / (n + height)))
-    return np.degrees(latitude), np.degrees(np.arctan2(y, x)), height
 
 
 def test_a_georeferenced_run_lies_on_the_globe(trained, tmp_path):

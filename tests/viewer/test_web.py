@@ -24,7 +24,7 @@ from blitzgs.view.views import viewmat
 from blitzgs.viewer.studio import open_model
 from blitzgs.viewer.web import contributions, web_file
 from blitzgs.viewer.world import World, looking
-from tests.browser import Browser, needs_chromium, wait_for
+from tests.browser import Browser, wait_for
 from tests.helpers import refused
 
 WIDTH, HEIGHT = 160, 120
@@ -81,7 +81,6 @@ def browser():
         yield browser
 
 
-@needs_chromium
 @pytest.mark.parametrize(
     ("comments", "degree"),
     [((), 3), (("comment SplatRenderMode: mip",), 1), ((LOD,), 0), ((LOD + " smooth",), 2)],
@@ -100,7 +99,6 @@ def test_the_picture_is_that_of_our_renderer(browser, tmp_path, comments, degree
     assert browser.errors() == []
 
 
-@needs_chromium
 def test_mouse_and_wheel_move_and_reset_goes_back(browser, tmp_path):
     opened = write_model(tmp_path / "m.ply", count=600)
     show(browser, opened, tmp_path)
@@ -163,7 +161,6 @@ def test_the_order_is_that_of_contributions(trained):
     np.testing.assert_allclose(found, weights.sum(dim=0), rtol=1e-3, atol=1e-4)
 
 
-@needs_chromium
 def test_a_run_and_its_checkpoints_are_exported(browser, trained, tmp_path, capsys):
     file = tmp_path / "out" / "run.html"
     assert main(["export", str(trained[1]), "--html", str(file)]) == 0

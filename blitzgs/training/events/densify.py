@@ -38,7 +38,8 @@ def run_density_event(state: TrainingState, event: Event) -> None:
     state.stepper.write_back()
     # The largest column, sh, does not decide anything; it is checked with each record of the log.
     check_table(state.table, state.progress.step, PARAMETERS[:-1])
-    limit = population_limit(state)
+    points, memory = len(state.capture.points), memory_limit(state.table, state.ranks)
+    limit = growth_limit(state.config.population, training_pixels(state), points, memory)
     report = change_population(state, event.time, density_rules(state, event.time, limit))
     moved = redistribute(state.table, state.ranks, MAX_IMBALANCE)
     # Views copy whole blocks of a table in host memory.
@@ -79,12 +80,6 @@ def _keep_sorted(state: TrainingState, event: Event, spread_now: int, is_sorted:
         _, spread_now = _over_all_ranks(state, {})
     state.progress.sorted_spread = spread_now
     return sorts
-
-
-def population_limit(state: TrainingState) -> GrowthLimit | None:
-    """Return the tightest limit on the population; None if there is none. Every rank calls this."""
-    points, memory = len(state.capture.points), memory_limit(state.table, state.ranks)
-    return growth_limit(state.config.population, training_pixels(state), points, memory)
 
 
 def _over_all_ranks(state: TrainingState, counts: dict[str, int]) -> tuple[dict[str, int], int]:
