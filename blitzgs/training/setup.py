@@ -17,6 +17,7 @@ from blitzgs.config.fields import FORK, Config
 from blitzgs.config.files import save_config
 from blitzgs.config.schedule import Schedule, stretched
 from blitzgs.distributed.group import Ranks
+from blitzgs.formats.gaussians import is_antialiased
 from blitzgs.formats.models import read_gaussians, with_degree
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.optim.table_adam import TableAdam
@@ -45,6 +46,7 @@ from blitzgs.training.sampler import BatchSampler, tour_of
 from blitzgs.training.state import Curve, TrainingState
 from blitzgs.training.step import Stepper
 from blitzgs.training.view_level import forget_views
+from blitzgs.util.errors import warn
 from blitzgs.view.levels import Levels, measure_levels
 from blitzgs.view.views import Space, ViewSet, trained_centres
 
@@ -310,6 +312,12 @@ def _of_file(
         limit = f"population.max_gaussians is {most:,}" if count else "a training needs some"
         raise ValueError(f"{path} (model.start) holds {count:,} Gaussians: {limit}")
     check_seen(found, path, capture)
+    if (marked := is_antialiased(found)) != config.model.antialiased and ranks.rank == 0:
+        how, other = ("is", "without") if marked else ("is not", "with")
+        warn(
+            f"{path} {how} marked as trained with antialiasing, and this run trains {other} it: "
+            f"--model.antialiased={str(marked).lower()} keeps the file's look"
+        )
     gate, _ = gate_of(found, space.unit)
     if (
         gate is None

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import os
 import re
+import warnings
 from types import SimpleNamespace
 
 import cv2
@@ -76,7 +77,9 @@ def test_a_training_begins_with_a_file(trained, whole, tmp_path, failure):
     out = tmp_path / "run"
     flags = ["--config=defaults", "--schedule.iterations=4", "--log.tensorboard=false"]
     arguments = ["train", "--data", str(trained[0]), "--out", str(out), "--start", str(whole)]
-    assert main([*arguments, *flags]) == 0
+    with warnings.catch_warnings(record=True) as told:
+        assert main([*arguments, *flags]) == 0
+        assert not any("antialiasing" in str(warning.message) for warning in told)
     first = read_gaussians(whole)
     table = open_model(out, Ranks()).table
     assert len(table) == len(first)
@@ -91,7 +94,8 @@ def test_a_training_begins_with_a_file(trained, whole, tmp_path, failure):
     )
     write_ply(tmp_path / "levels.ply", **vars(first))
     arguments[-3:] = [str(tmp_path / "c"), "--start", str(tmp_path / "levels.ply")]
-    assert main([*arguments, *flags]) == 0
+    with pytest.warns(UserWarning, match="is not marked as .*: --model.antialiased=false keeps"):
+        assert main([*arguments, *flags, "--model.antialiased=true"]) == 0
     assert not open_model(tmp_path / "c", Ranks()).table["level"].any()
 
 
