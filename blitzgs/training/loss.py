@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from blitzgs.frame.tiles import LOSS_HALO
 from blitzgs.ops.photometric import photometric_fwd_bwd
 
 if TYPE_CHECKING:
@@ -55,10 +56,12 @@ def loss_terms(
     """Compare rendered views with their photographs; on several ranks each compares its own tiles.
 
     `extent`: size of the scene in the unit of the means; L_scale is relative to it. `shown`: the images to
-    compare, [B, H, W, 3], instead of the frame's; `v_renders` is then their gradient. A rank must have
-    composited `LOSS_HALO` pixels beyond its tiles.
+    compare, [B, H, W, 3], instead of the frame's; `v_renders` is then their gradient. ValueError: a rank has
+    not composited all pixels that its loss reads.
     """
     count, assignment = len(frame.views), frame.assignment
+    if assignment is not None and assignment.ranges.halo < LOSS_HALO:
+        raise ValueError(f"the loss reads {LOSS_HALO} px beyond a rank's tiles: divide them with that halo")
     parts, v_renders, scale_reg, opacity_reg = photometric_fwd_bwd(
         frame.renders if shown is None else shown,
         batch.targets,
