@@ -117,9 +117,10 @@ def _arguments(parser: Parser, chosen: str, given: list[str]) -> argparse.Namesp
     args, unknown = parser.parse_known_args(given)
     parser_of = getattr(args, "parser", parser)
     if chosen == "train":
-        # The configuration says what may have been meant by a field without its section.
-        fields = [text for text in unknown if re.match("--.*=", text) and not flag_meant(parser_of, text)]
-        args.overrides += fields
+        # The configuration says what may have been meant by an unknown field or one without its section.
+        given_values = [text for text in unknown if re.match("--.*=", text)]
+        fields = [t for t in given_values if "." in t.partition("=")[0] or not flag_meant(parser_of, t)]
+        args.overrides = [*args.overrides, *fields]
         unknown = [text for text in unknown if text not in fields]
     if unknown:
         meant = flag_meant(parser_of, unknown[0])

@@ -13,6 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
+from blitzgs.config.files import REMOVED
 from blitzgs.config.ranges import RANGES
 from blitzgs.util.errors import printable
 
@@ -170,6 +171,8 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, *arguments: object, **settings: object) -> None:
         super().__init__(*arguments, **settings | {"allow_abbrev": False})  # type: ignore[arg-type]
+        # argparse would take -1e-3 for a flag.
+        self._negative_number_matcher = re.compile(r"-\.?\d")
 
     def error(self, message: str) -> NoReturn:
         """Print a message without the usage, which is many lines long, and exit with status 2."""
@@ -202,7 +205,7 @@ def flags_of(parser: argparse.ArgumentParser) -> dict[str, bool]:
 def flag_meant(parser: argparse.ArgumentParser, text: str) -> str | None:
     """Return the command's flag that an unknown one resembles; None if no flag is like it."""
     name = text.partition("=")[0]
-    flags = list(flags_of(parser))
+    flags = [flag for flag in flags_of(parser) if flag[2:] not in REMOVED]
     if not name.startswith("--"):
         return None
     if len(longer := [flag for flag in flags if flag.startswith(name)]) == 1:

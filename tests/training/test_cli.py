@@ -96,6 +96,8 @@ def test_torchrun_entry(trained, tmp_path):
         ("train --data /nowhere --out x", 1, "/nowhere"),
         ("train --data d --out x --loss.ssim --resume", 2, "argument --loss.ssim: expected one argument"),
         ("train --data d --out x --loss.sim 1", 2, "--loss.sim 1; did you mean --loss.ssim?"),
+        ("train --data d --out x --loss.sim=1", 1, "loss.sim: unknown field; did you mean 'ssim'"),
+        ("train --data d --out x --loss.ssim -1e-3", 1, "loss.ssim: must be in [0, 1], got -0.001"),
         ("train --data d --out x --max_gaussians=1", 1, "did you mean 'population.max_gaussians'"),
         ("train --data d --out x --optimiser.beta1=0.1", 1, "optimiser.beta1: this field was removed"),
         ("train --data d --out x --loss.ssim 9", 1, "loss.ssim: must be in [0, 1], got 9"),
