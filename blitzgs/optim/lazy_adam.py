@@ -15,7 +15,9 @@ from blitzgs.ops.derivatives import KeptMarks, distinct_rows
 from blitzgs.ops.lazy_adam import GrowingSchedule
 from blitzgs.optim.lazy_adam_checks import (
     MOMENTS,
+    check_chosen,
     check_group,
+    check_listed,
     check_mask,
     check_new_rows,
     check_order,
@@ -192,13 +194,16 @@ class LazyAdam(torch.optim.Optimizer):
                 `moment_step`, which must stay beside the moments if rows change.
 
         Raises:
-            ValueError: `moments` of some rows only.
+            TypeError: `params` or `rows` are no tensors.
+            ValueError: `moments` of some rows only, or, on the CPU, a row that a parameter does not have.
         """
         if moments and rows is not None:
             raise ValueError("LazyAdam.catch_up: moments=True takes all rows; leave `rows` out")
         if isinstance(params, Tensor):
             params = [params]
-        chosen = None if params is None else set(map(id, params))
+        given = list(params or ())
+        check_chosen(given)
+        chosen = None if params is None else set(map(id, given))
         for group, index, param in self._places():
             if (chosen is not None and id(param) not in chosen) or _STEPS[0] not in self.state.get(param, ()):
                 continue
@@ -207,6 +212,8 @@ class LazyAdam(torch.optim.Optimizer):
             if moments:
                 _settle(param, state, schedule)
             elif behind:
+                if rows is not None:
+                    check_listed(rows, count, param)
                 _move(schedule.catch_up_, param, state, rows, count)
             # As after a step, a backward pass of an image made before must fail. Some rows may catch up
             # between the views of a step: the image of another view was made of its own, which are current.
