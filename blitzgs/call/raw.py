@@ -132,6 +132,9 @@ def raw_rasterization(
     params = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     sh_params = {"sh0": sh0} if shN is None else {"sh0": sh0, "shN": shN}
     harmonics = list(sh_params.values())
+    lazy = _lazy(optimizers)
+    for optimizer in lazy:  # before views of the parameters are made, which would be out of date
+        optimizer.catch_up(params.values())
     if opacities.dim() == 2 and opacities.shape[1] == 1:
         tensors["opacities"] = opacities = of_shape(opacities, opacities.shape[:1])
     if sh0.dim() == 2 and sh0.shape[1] == 3:
@@ -143,9 +146,6 @@ def raw_rasterization(
     )
     if sparse_grad and torch.is_grad_enabled():
         _check_leaves(params | sh_params if shaded else params)
-    lazy = _lazy(optimizers)
-    for optimizer in lazy:
-        optimizer.catch_up(params.values())
     given = {**tensors, "viewmats": viewmats, "Ks": Ks, "shN": shN}
     if not shaded:
         del given["sh0"], given["shN"]

@@ -15,7 +15,9 @@ from blitzgs.ops.derivatives import KeptMarks, distinct_rows
 from blitzgs.ops.lazy_adam import GrowingSchedule
 from blitzgs.optim.lazy_adam_checks import (
     MOMENTS,
+    check_chosen,
     check_group,
+    check_listed,
     check_mask,
     check_new_rows,
     check_order,
@@ -192,21 +194,31 @@ class LazyAdam(torch.optim.Optimizer):
                 `moment_step`, which must stay beside the moments if rows change.
 
         Raises:
-            ValueError: `moments` of some rows only.
+            TypeError: `params` or `rows` are no tensors.
+            ValueError: `moments` of some rows only, or, on the CPU, a row that a parameter does not have.
         """
         if moments and rows is not None:
             raise ValueError("LazyAdam.catch_up: moments=True takes all rows; leave `rows` out")
         if isinstance(params, Tensor):
             params = [params]
-        chosen = None if params is None else set(map(id, params))
+        given = list(params or ())
+        check_chosen(given)
+        chosen = None if params is None else set(map(id, given))
         for group, index, param in self._places():
             if (chosen is not None and id(param) not in chosen) or _STEPS[0] not in self.state.get(param, ()):
                 continue
             state, schedule = self._tables_of(group, index, param)
+            behind = schedule.current < schedule.last
             if moments:
                 _settle(param, state, schedule)
-            elif schedule.current < schedule.last:
+            elif behind:
+                if rows is not None:
+                    check_listed(rows, count, param)
                 _move(schedule.catch_up_, param, state, rows, count)
+            # As after a step, a backward pass of an image made before must fail. Some rows may catch up
+            # between the views of a step: the image of another view was made of its own, which are current.
+            if behind and rows is None:
+                torch.autograd.graph.increment_version(param)
 
     def bring_up_to_date(self) -> None:
         """Deprecated name of `catch_up(moments=True)`."""
@@ -334,17 +346,19 @@ class LazyAdam(torch.optim.Optimizer):
         # Code that moves an optimiser's state to a device moves this too; others keep a plain number.
         if not (isinstance(taken, Tensor) and taken.is_cpu and taken.dtype == torch.float32):
             state["step"] = taken = _counter(taken)
-        step, betas = int(taken), tuple(group["betas"])
+        step, rules = int(taken), (tuple(group["betas"]), group["eps"])
         schedule: GrowingSchedule | None = group[_SCHEDULES].get(index)
-        if schedule is not None and (schedule.last != step or schedule.betas != betas or schedule.is_full()):
+        # The steps that rows missed had the betas and the eps of their time.
+        if schedule is not None and (
+            schedule.last != step or (schedule.betas, schedule.eps) != rules or schedule.is_full()
+        ):
             if _STEPS[0] in state:
                 _settle(param, state, schedule)
             schedule = None
         if schedule is None:
             check_param(param)
-            schedule = GrowingSchedule(betas, group["eps"], param.dtype, param.device, step)
+            schedule = GrowingSchedule(*rules, param.dtype, param.device, step)
             group[_SCHEDULES][index] = schedule
-        schedule.eps = group["eps"]
         if _STEPS[0] not in state:
             place = torch.full((len(param),), schedule.row, dtype=torch.int32, device=param.device)
             state.update({name: place.clone() for name in _STEPS})

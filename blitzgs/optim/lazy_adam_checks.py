@@ -57,6 +57,25 @@ def check_rows(param: Tensor, state: Mapping[str, Any]) -> None:
             )
 
 
+def check_chosen(params: Sequence[Tensor]) -> None:
+    """Check the parameters that `catch_up` takes (TypeError: one is not a tensor, as a name)."""
+    for param in params:
+        _check_tensor("catch_up: params", param)
+
+
+def check_listed(rows: Tensor, count: Tensor | None, param: Tensor) -> None:
+    """Check the rows that `catch_up` takes, on the CPU (on CUDA, the host would wait for them).
+
+    TypeError, ValueError: as `LazyAdam.catch_up`.
+    """
+    _check_tensor("catch_up: rows", rows)
+    if rows.is_cpu:
+        listed = rows if count is None else rows[: int(count)]
+        wrong = listed[(listed < 0) | (listed >= len(param))]
+        if len(wrong) > 0:
+            raise ValueError(f"LazyAdam.catch_up: rows must be 0 to {len(param) - 1}, got {wrong[0].item()}")
+
+
 def check_saved(saved: Mapping[str, Any], params: Sequence[Tensor]) -> None:
     """Check the state that `load_state_dict` takes.
 

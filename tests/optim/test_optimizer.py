@@ -239,14 +239,29 @@ def test_a_state_that_begins_anew_begins_anew():
     pair.require_equal()
 
 
-def test_betas_may_change():
+@pytest.mark.parametrize("changed", [{"betas": (0.5, 0.9)}, {"eps": 0.1}], ids=str)
+def test_betas_and_eps_may_change(changed):
     pair = Pair(("cpu", torch.float64))
     for number in range(12):
         if number == 6:
             for optimizer in (pair.ours, pair.torchs):
-                optimizer.param_groups[0]["betas"] = (0.5, 0.9)
+                optimizer.param_groups[0].update(changed)
         pair.step()
     pair.require_equal()
+
+
+@pytest.mark.parametrize("change", [LazyAdam.catch_up, LazyAdam.state_dict])
+def test_a_backward_pass_fails_once_its_parameters_caught_up(backend, change):
+    pair = Pair(backend)
+    pair.step()
+    pair.catch_up()
+    loss = pair.lazy["means"].square().sum()
+    change(pair.ours)  # all rows are current, none moves
+    loss.backward()
+    pair.step()
+    loss = pair.lazy["means"].square().sum()
+    change(pair.ours)
+    refused(RuntimeError, "modified by an inplace operation", loss.backward)
 
 
 @pytest.mark.parametrize("index", [0, 2, 4])

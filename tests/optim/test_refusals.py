@@ -71,6 +71,22 @@ def test_wrong_use_is_refused():
     refused(ValueError, "a parameter has 4 rows and its exp_avg 5", optimizer.step)
 
 
+def test_what_cannot_catch_up_is_refused():
+    """A name would leave all rows behind, and a row that is not there would end the process."""
+    param = torch.ones(4, 3, requires_grad=True)
+    optimizer = LazyAdam([{"params": [param], "name": "means"}])
+    for row in (1, 2):
+        param.grad = torch.sparse_coo_tensor([[row]], torch.ones(1, 3), (4, 3), check_invariants=True)
+        optimizer.step()
+    for params in ("means", {"means": param}):
+        refused(TypeError, r"catch_up: params must be a torch\.Tensor, got str", optimizer.catch_up, params)
+    refused(TypeError, r"catch_up: rows must be a torch\.Tensor, got list", optimizer.catch_up, rows=[1])
+    for row in (-1, 4):
+        rows = torch.tensor([0, row], dtype=torch.int32)
+        refused(ValueError, f"catch_up: rows must be 0 to 3, got {row}", optimizer.catch_up, rows=rows)
+    optimizer.catch_up(rows=rows, count=torch.tensor([1], dtype=torch.int32))
+
+
 @pytest.mark.cuda
 def test_memory_of_another_device_is_refused():
     """Kernels that read it would end all work of the process on the GPU."""
