@@ -86,7 +86,7 @@ def plan(args: Any, overrides: Sequence[str]) -> list[CityRun]:
         raise ValueError(f"--held-out must be below the number of views, {views}, got {args.held_out}")
     split = args.out / "held_out.txt"
     held_out(args.city, args.held_out, split)
-    capture = {"city": f"'{args.city}' --data.split={json.dumps(str(split.resolve()))}"}
+    capture = {"city": f"'{args.city}' --data.split={json.dumps(str(split))}"}
     common = " ".join([f"--schedule.scale={args.scale}", "--log.every=200", *overrides])
     arms = {arm: ARMS[arm] for arm in args.arms} | dict(map(parse_named, args.arm))
     if not arms:

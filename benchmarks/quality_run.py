@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import commit, environment, synchronize
+from harness import ROOT, commit, environment, synchronize
 from opponents import spatial_partition
 from opponents.gsplat_training import GsplatTrainer
 from quality_plan import RunSpec
@@ -218,6 +218,12 @@ def figures(recorder: Recorder, peak_gaussians: int) -> dict[str, Any]:
     }
 
 
+def named_from_root(source: str) -> str:
+    """Return the path of a recipe of this repository from its root; any other source as it is."""
+    path = Path(source).resolve()
+    return str(path.relative_to(ROOT)) if path.is_file() and path.is_relative_to(ROOT) else source
+
+
 def describe(spec: RunSpec) -> dict[str, Any]:
     """Return the part of a result that describes its run, finished or failed."""
     return {
@@ -227,7 +233,7 @@ def describe(spec: RunSpec) -> dict[str, Any]:
         "seed": spec.seed,
         "ranks": spec.ranks,
         "settings": spec.settings,
-        "source": os.path.relpath(spec.source) if spec.source.endswith((".yaml", ".yml")) else spec.source,
+        "source": named_from_root(spec.source),
         "overrides": [*spec.data[1:], *spec.overrides],
         "commit": commit(),
     }

@@ -219,6 +219,7 @@ def test_a_run_that_ends_early_leaves_what_is_known(city, capsys):
     assert status == 0 and run["finished"] and run["popping"]["frames"] == 3
     (path,) = (city.parent / "out" / "runs").iterdir()
     whole = json.loads(path.read_text())
+    assert whole["source"] == "configs/city.yaml"  # wherever the repository is
     for missing in (["psnr", "ssim"], ["phases"], ["environment", "finished"]):
         for name in missing:
             del whole[name]
