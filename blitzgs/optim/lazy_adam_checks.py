@@ -71,9 +71,10 @@ def check_listed(rows: Tensor, count: Tensor | None, param: Tensor) -> None:
     _check_tensor("catch_up: rows", rows)
     if rows.is_cpu:
         listed = rows if count is None else rows[: int(count)]
-        wrong = listed[(listed < 0) | (listed >= len(param))]
-        if len(wrong) > 0:
-            raise ValueError(f"LazyAdam.catch_up: rows must be 0 to {len(param) - 1}, got {wrong[0].item()}")
+        low, high = map(int, torch.aminmax(listed)) if len(listed) > 0 else (0, -1)
+        if low < 0 or high >= len(param):
+            wrong = low if low < 0 else high
+            raise ValueError(f"LazyAdam.catch_up: rows must be 0 to {len(param) - 1}, got {wrong}")
 
 
 def check_saved(saved: Mapping[str, Any], params: Sequence[Tensor]) -> None:
