@@ -95,6 +95,9 @@ class ModelConfig:
     Attributes:
         sh_degree: highest spherical-harmonics degree, 0..3.
         background: colour behind everything, RGB in [0, 1].
+        random_background: each training view has a random colour behind everything instead, so that
+            Gaussians have to cover all that photographs show; otherwise places of the background's colour
+            stay transparent. No effect if photographs have alpha, which are composited over `background`.
         antialiased: scale opacities to compensate the screen-space blur (Mip-Splatting's 2D filter); false:
             classic 3DGS.
         near: near plane, relative to extent. 0: a quarter of the depth of the nearest points that training
@@ -111,6 +114,7 @@ class ModelConfig:
 
     sh_degree: Annotated[int, Range(0, 3)] = 3
     background: Annotated[tuple[float, float, float], Range(0, 1)] = (0.0, 0.0, 0.0)
+    random_background: bool = False
     antialiased: bool = False
     near: Amount = 0.0
     deterministic: bool = False
@@ -235,15 +239,13 @@ class LossConfig:
             minimises the mean of these losses, so a new run sets `opacity` to this weight divided by the
             number of training views, from 0.005 to 0.05. The run's own configuration has the result in
             `opacity`, and 0 here. 0: `opacity` is the weight.
-        scale: weight of the mean smallest axis of the visible Gaussians.
-        scale_reference: that axis is measured in units of extent x scale_reference.
+        scale: weight of the mean smallest axis of the visible Gaussians, in units of ten times the extent.
     """
 
     ssim: Share = 0.2
     opacity: Amount = 0.0
     opacity_total: Amount = 0.0
     scale: Amount = 10.0
-    scale_reference: Annotated[float, Range(1e-6, 1e6)] = 10.0
 
 
 @dataclass(frozen=True)

@@ -62,6 +62,7 @@ REMOVED: Mapping[str, Any] = {
     "optimiser.position_final": Share("optimiser.position", POSITION_LEFT),
     "optimiser.sh_rest": Share("optimiser.sh_dc", SH_SHARE),
     "loss.size": 0.0,
+    "loss.scale_reference": 10.0,
     "population.absolute_gradients": False,
     "population.absolute_threshold": IGNORED,
     "population.relocate": False,

@@ -116,6 +116,7 @@ def render_frame(
     assignment: TileAssignment | None = None,
     transport: Transport | None = None,
     backward_follows: bool = False,
+    backgrounds: Tensor | None = None,
 ) -> Frame:
     """Render views of a table whose active rows have no pending optimiser steps.
 
@@ -131,6 +132,7 @@ def render_frame(
             the host; the result does not depend on it. None: a new one.
         backward_follows: prepare for a backward pass, which is then faster; the backward pass also works
             without.
+        backgrounds: the colour behind everything in each view, float32 [B, 3]; None: that of the options.
 
     Returns:
         The frame; its images do not depend on the order of the table's rows, on inactive rows, or on how many
@@ -138,7 +140,8 @@ def render_frame(
     """
     transport = transport or open_transport(None if assignment is None else assignment.ranks)
     grid = tile_grid(views, options, assignment)
-    backgrounds = _backgrounds(options.background, len(views), views.viewmats.device)
+    if backgrounds is None:
+        backgrounds = _backgrounds(options.background, len(views), views.viewmats.device)
 
     def attempt(capacity: Sizes | None) -> tuple[Exchange, Any]:
         rows = active(capacity) if callable(active) else active

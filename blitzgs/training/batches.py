@@ -34,6 +34,7 @@ class Batch:
     masks: Tensor | None  # uint8 [B, H, W], 0 = excluded pixel; None when no view of the batch has a mask
     samples: Tensor  # float32 [B], number of values in a view's mean: 3 x its pixels that count, at least 1
     ranges: TileRanges | None  # the tiles of each rank; None on one rank
+    backgrounds: Tensor | None = None  # float32 [B, 3], random; None: the colour of the render options
 
 
 # Batches that are uploaded beyond the requested one.
@@ -53,6 +54,7 @@ class _Plan:
     ranges: TileRanges | None
     rows: list[tuple[int, int]]  # the pixel rows [y0, y1) of each view that this rank needs
     reduction: int  # by which factor the photographs are reduced
+    backgrounds: Tensor | None  # float64 [B, 3]
     is_prefetched: bool = False  # whether its photographs are being decoded
     loading: Future[tuple[Batch, _Slot]] | None = None
 
@@ -80,8 +82,9 @@ class _Slot:
             return
         count, height, width, masked = shape
         on_gpu = self._device.type == "cuda"
-        # Views as `ViewSet.write` writes them, then each view's samples; photographs; 0 = excluded pixel.
-        numbers = torch.empty(count * (VIEW_NUMBERS + 1), dtype=torch.float32, pin_memory=on_gpu)
+        # Views as `ViewSet.write` writes them, each view's samples, each view's background; photographs;
+        # 0 = excluded pixel.
+        numbers = torch.empty(count * (VIEW_NUMBERS + 4), dtype=torch.float32, pin_memory=on_gpu)
         pixels = torch.empty((count, height, width, 3), dtype=torch.uint8, pin_memory=on_gpu)
         included = torch.empty((masked * count, height, width), dtype=torch.uint8, pin_memory=on_gpu)
         self._host = numbers, pixels, included
@@ -89,11 +92,13 @@ class _Slot:
             torch.empty_like(part, device=self._device) if on_gpu else part for part in self._host
         ]
         self._shape = shape
-        self.numbers, self.pixels, self.included = (part.numpy() for part in self._host)
+        of_host, self.pixels, self.included = (part.numpy() for part in self._host)
+        parts = [count * VIEW_NUMBERS, count * (VIEW_NUMBERS + 1)]
+        self.views, self.samples, self.backgrounds = np.split(of_host, parts)
         numbers, self._targets, included = self._on_device
         self._masks = included if masked else None
-        self._views = unpack_views(numbers[:-count], width, height)
-        self._samples = numbers[-count:]
+        views, self._samples, backgrounds = numbers.tensor_split(parts)
+        self._views, self._backgrounds = unpack_views(views, width, height), backgrounds.view(count, 3)
 
     def upload(self, rows: list[tuple[int, int]]) -> None:
         """Upload from the first to the last needed pixel row; `rows` has those of each view, [y0, y1)."""
@@ -107,9 +112,11 @@ class _Slot:
                 host, on_device = host.flatten(0, 1)[some], on_device.flatten(0, 1)[some]
             on_device.copy_(host, non_blocking=True)
 
-    def batch(self, indices: list[int], ranges: TileRanges | None) -> Batch:
+    def batch(self, plan: _Plan) -> Batch:
         """Return the batch that was assembled in this memory."""
-        return Batch(indices, self._views, self._targets, self._masks, self._samples, ranges)
+        backgrounds = None if plan.backgrounds is None else self._backgrounds
+        parts = self._views, self._targets, self._masks, self._samples
+        return Batch(plan.indices, *parts, plan.ranges, backgrounds)
 
 
 class BatchLoader:
@@ -128,10 +135,12 @@ class BatchLoader:
         device: torch.device,
         ahead: int = AHEAD,
         owners: TileOwners | None = None,
+        random_background: bool = False,
     ) -> None:
         """Prepare to upload `ahead` batches beyond the requested one; the photographs of more are decoded.
 
         With `owners`, this rank decodes and uploads only the pixel rows that its tiles' loss reads.
+        `random_background`: each view has a random colour behind everything.
         """
         self._images = images
         self._views = views
@@ -142,7 +151,7 @@ class BatchLoader:
         # It cannot stop alone in the middle of a step, so it continues and treats all pixels as masked.
         self.lost: str | None = None
         self.waited = 0.0  # seconds that the caller has waited for batches so far
-        self._train = train
+        self._train, self._random_background = train, random_background
         self._sampler = sampler
         self._device = device
         self._ahead = ahead
@@ -200,14 +209,15 @@ class BatchLoader:
     def _plan(self, step: int) -> _Plan:
         indices = [self._train[view] for view in self._sampler.batch(step)]
         reduction = self._sampler.reduction(step)
+        backgrounds = self._sampler.backgrounds(step) if self._random_background else None
         width, height = self._views.size(indices, reduction)
         if self._owners is None:
-            return _Plan(indices, None, [(0, height)] * len(indices), reduction)
+            return _Plan(indices, None, [(0, height)] * len(indices), reduction, backgrounds)
         # This is done in the caller's thread and not in the other one, and always as many steps ahead: at
         # this point all ranks know the same costs. Those of another resolution belong to another number of
         # tiles, and are not used.
         ranges = self._owners.plan(step, indices, width, height, halo=LOSS_HALO)
-        return _Plan(indices, ranges, ranges.pixel_rows(self._owners.ranks.rank), reduction)
+        return _Plan(indices, ranges, ranges.pixel_rows(self._owners.ranks.rank), reduction, backgrounds)
 
     def _drop(self, step: int) -> None:
         if (loading := self._plans.pop(step).loading) is not None:
@@ -271,9 +281,11 @@ class BatchLoader:
                 slot.pixels[view, y0:y1] = strip
         for place, mask in zip(slot.included, masks, strict=False):  # no place where no view has a mask
             place[...] = 1 if mask is None else mask.numpy()
-        self._views.write(indices, slot.numbers[:-count], plan.reduction)
-        slot.numbers[-count:] = samples
+        self._views.write(indices, slot.views, plan.reduction)
+        slot.samples[:] = samples
+        if plan.backgrounds is not None:
+            slot.backgrounds[:] = plan.backgrounds.flatten().numpy()
         slot.upload(rows)
         if self._stream is not None:
             slot.uploaded.record(self._stream)
-        return slot.batch(indices, plan.ranges)
+        return slot.batch(plan)

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 # The limits of the `loss.opacity` that a run computes from `loss.opacity_total`: about the range that was
 # measured (docs/decisions.md).
 LEAST_OPACITY, MAX_OPACITY = 0.005, 0.05
+# `loss.scale` counts in this many extents.
+SCALE_UNIT = 10.0
 
 
 class LossTerms(NamedTuple):
@@ -71,7 +73,7 @@ def loss_terms(
         *((0, -1) if assignment is None else assignment.own_tiles),
         samples=batch.samples,
         visible=frame.visible,
-        scale_weight=config.scale / (extent * config.scale_reference * count),
+        scale_weight=config.scale / (extent * SCALE_UNIT * count),
         opacity_weight=config.opacity,
     )
     return LossTerms(

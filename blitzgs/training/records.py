@@ -24,7 +24,7 @@ from blitzgs.runs.guard import check_table, find_bad
 from blitzgs.runs.log import records
 from blitzgs.runs.run_files import LOG, PICTURE
 from blitzgs.training.batches import Batch
-from blitzgs.training.loss import batch_psnr, opacity_term, photometric, scale_term
+from blitzgs.training.loss import SCALE_UNIT, batch_psnr, opacity_term, photometric, scale_term
 from blitzgs.training.state import TrainingState
 from blitzgs.util.charts import line_chart
 from blitzgs.util.errors import warn
@@ -126,7 +126,7 @@ def measure_step(state: TrainingState, frame: Frame, batch: Batch) -> HostCopy:
     counts = state.ranks.all_reduce(torch.stack([find_bad(table), active, visible, population]))
     scale = opacity = batch.samples.new_zeros(())
     if loss.scale > 0:
-        scale = scale_term(frame, table, extent * loss.scale_reference).mean()
+        scale = scale_term(frame, table, extent * SCALE_UNIT).mean()
     if loss.opacity > 0:
         opacity = opacity_term(frame, table).mean()
     terms = torch.stack([scale, opacity, batch_psnr(frame, batch)])

@@ -9,6 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from blitzgs.capture.cameras import Camera, Float64, camera_centres
 from blitzgs.capture.lengths import depths_seen, sampled
@@ -77,6 +78,10 @@ class BatchSampler:
     def reduction(self, step: int) -> int:
         """Return by which factor the photographs of a step (0-based) are reduced."""
         return 1 if self.schedule is None else self.schedule.reduction(step * self.batch_size)
+
+    def backgrounds(self, step: int) -> Tensor:
+        """Return a random colour for each view of a step (0-based), float64 [B, 3] in (0, 1)."""
+        return uniform(torch.arange(3 * self.batch_size), self._seed, step, 3).view(-1, 3)
 
     def _group_batches(self, size: int, rounds: int) -> int:
         return rounds * size // self.batch_size

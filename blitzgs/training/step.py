@@ -104,7 +104,7 @@ class Stepper:
             return rows
 
         frame = render_frame(
-            table, views, options, active, assignment, self._transport, backward_follows=True
+            table, views, options, active, assignment, self._transport, True, batch.backgrounds
         )
         if self.exposures is None:
             terms = loss_terms(frame, batch, self._loss, self._extent)

@@ -81,6 +81,7 @@ class Trainer:
             state.sampler,
             ranks.device,
             owners=state.owners if ranks.world_size > 1 else None,
+            random_background=config.model.random_background and not capture.has_alpha,
         )
         self._guard = LossGuard()
         self._warned_of_masks = False

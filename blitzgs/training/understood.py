@@ -200,6 +200,8 @@ def _alpha(capture: Capture, config: Config) -> str:
     colour = ", ".join(f"{value:g}" for value in config.model.background)
     about = capture.about
     extra = f"; a further band of {about.extra_bands} is not used" if about.extra_bands else ""
+    if config.model.random_background:
+        extra += "; model.random_background has no effect"
     return f"{about.with_alpha} photographs have it; composited over model.background ({colour}){extra}"
 
 

@@ -344,7 +344,8 @@ def test_torchrun_restarts_after_a_rank_is_killed(capture, trained, tmp_path):
 
 RELOCATION = (
     "population.strategy=relocation", "population.max_gaussians=450", "population.min_opacity=0.06",
-    "loss.opacity=0.01", "model.antialiased=true", "optimiser.opacity=0.1", "optimiser.position_noise=1e6",
+    "loss.opacity=0.01", "model.antialiased=true", "model.random_background=true", "optimiser.opacity=0.1",
+    "optimiser.position_noise=1e6",
 )  # fmt: skip
 # The second importance pass at the end of density control keeps half. Then rates fall.
 PRUNED = (

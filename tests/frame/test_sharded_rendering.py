@@ -18,7 +18,7 @@ from blitzgs.frame.transport.protocol import CapacityEstimate
 from blitzgs.ops.projection_types import Sizes, Views
 from blitzgs.table.table import GaussianTable
 from blitzgs.training.batches import Batch
-from blitzgs.training.loss import batch_psnr, loss_terms, photometric, scale_term
+from blitzgs.training.loss import SCALE_UNIT, batch_psnr, loss_terms, photometric, scale_term
 from tests.distributed.rank_harness import EIGHT, on_each_device, run_ranks
 from tests.helpers import look_at_origin, parameter_gradients, sum_parts
 from tests.training.tiny import random_gaussians
@@ -112,7 +112,7 @@ def _render(ranks):
             {
                 "image": image.cpu(),
                 "loss": photometric(sums, samples, LOSS),
-                "scale": scale_term(frame, table, EXTENT * LOSS.scale_reference).cpu(),
+                "scale": scale_term(frame, table, EXTENT * SCALE_UNIT).cpu(),
                 "psnr": batch_psnr(frame, batch).cpu(),
                 "gradients": [gradient.cpu() for gradient in dense],
                 "work": int(tile_work.sum()),

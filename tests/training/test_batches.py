@@ -45,7 +45,8 @@ def make_loader(capture):
         def make(device, ahead, train=EVERY):
             views = ViewSet(capture[0], Space(offset=(0.0, 0.0, 0.0), unit=1.0, extent=1.0), device)
             sampler = BatchSampler([SIZES[camera] for camera in train], 2, seed=3)
-            loader = BatchLoader(capture[1], views, list(train), sampler, device, ahead)
+            parts = capture[1], views, list(train), sampler, device, ahead
+            loader = BatchLoader(*parts, random_background=True)
             loaders.callback(loader.close)
             return loader, sampler, views
 
@@ -63,14 +64,16 @@ def test_each_step_gets_its_own_views(capture, make_loader, device, ahead):
         batch = loader.get(step, STEPS)
         if device.type == "cuda":
             torch.cuda._sleep(1_000_000)  # a slow step, which the batches made ahead must not overtake
-        tensors = (batch.targets, batch.masks, batch.samples, batch.views.viewmats, batch.views.Ks)
+        views_of_batch = batch.views.viewmats, batch.views.Ks, batch.backgrounds
+        tensors = (batch.targets, batch.masks, batch.samples, *views_of_batch)
         copies = [None if tensor is None else tensor.clone() for tensor in tensors]
         seen.append((batch.indices, batch.views.width, batch.views.height, *copies))
-    for step, (indices, width, height, targets, masks, samples, viewmats, Ks) in enumerate(seen):
+    for step, (indices, width, height, targets, masks, samples, viewmats, Ks, backgrounds) in enumerate(seen):
         assert indices == [train[view] for view in sampler.batch(step)]
         expected = views.pick(indices)
         assert (width, height) == SIZES[indices[0]] == (expected.width, expected.height)
         assert torch.equal(viewmats, expected.viewmats) and torch.equal(Ks, expected.Ks)
+        assert torch.equal(backgrounds.cpu(), sampler.backgrounds(step).float())
         assert torch.equal(targets.cpu(), torch.stack([images.get(index) for index in indices]))
         counted = [torch.ones(height, width) if (m := images.mask(i)) is None else m for i in indices]
         assert samples.tolist() == [3 * int(mask.sum()) for mask in counted]
@@ -78,6 +81,9 @@ def test_each_step_gets_its_own_views(capture, make_loader, device, ahead):
             assert torch.equal(masks.cpu(), torch.stack(counted).byte())
         else:
             assert masks is None
+    colours = torch.stack([backgrounds for *_, backgrounds in seen]).cpu()
+    assert len(colours.flatten().unique()) == colours.numel()
+    assert 0 < colours.min() < 0.05 and 0.95 < colours.max() < 1 and abs(colours.mean() - 0.5) < 0.1
 
 
 @pytest.mark.parametrize("ahead", [0, 3])

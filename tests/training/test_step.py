@@ -75,7 +75,7 @@ def test_a_step_tells_its_stages_and_lowers_the_loss():
     assert losses[-1] < losses[0] - 0.01
 
 
-EXTENT, CONFIG = 1.7, LossConfig(opacity=0.3, scale=0.5, scale_reference=2.0)
+EXTENT, CONFIG = 1.7, LossConfig(opacity=0.3, scale=2.5)
 
 
 def test_regularisers_are_means_over_the_visible_gaussians_of_a_view(device):

@@ -10,6 +10,7 @@ import torch
 from blitzgs.config.files import ConfigError, load_config, to_dict
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import run_files, trained_model
+from blitzgs.runs.folder import open_run
 from blitzgs.runs.guard import NonFiniteError
 from blitzgs.training.events import densify
 from blitzgs.training.trainer import Trainer
@@ -150,6 +151,27 @@ def test_batches_masks_and_background(tmp_path):
     assert summary["images"] == 120 and trainer.state.progress.step == 30
     assert summary["psnr"] > 15
     assert trainer.state.progress.peak_gaussians <= 420
+
+
+@pytest.mark.parametrize("has_alpha", [False, True], ids=["opaque", "alpha"])
+def test_random_backgrounds_make_gaussians_cover_what_photographs_show(tmp_path, has_alpha):
+    """Photographs of the background's colour need no Gaussian otherwise; with alpha that is what they say."""
+    capture, images = scene = tiny_scene()
+    capture.has_alpha = has_alpha
+    images.images = [torch.full_like(image, 51) for image in images.images]
+    options = (
+        "model.background=[0.2, 0.2, 0.2]", "loss.opacity=0.3", "optimiser.opacity=0.1",
+        "schedule.densify_from=90",
+    )  # fmt: skip
+    covered = {}
+    for random in (False, True):
+        folder = tmp_path / str(random)
+        train(folder, *options, f"model.random_background={str(random).lower()}", scene=scene)
+        covered[random] = open_run(folder).model().render(capture.cameras[0], alpha=True)[..., 3].mean()
+    if has_alpha:
+        assert covered[True] == covered[False]
+    else:
+        assert covered[True] > covered[False] + 0.2
 
 
 @pytest.mark.parametrize("white", [0, 1], ids=["black", "inverted"])

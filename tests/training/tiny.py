@@ -69,6 +69,7 @@ class Capture:
     root: Path = Path("/nowhere")
     about: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(frame=None, random_points=False))
     apart: list[int] = field(default_factory=list)
+    has_alpha: bool = False
 
     @property
     def near(self) -> float:
