@@ -114,7 +114,7 @@ class ModelConfig:
 
     sh_degree: Annotated[int, Range(0, 3)] = 3
     background: Annotated[tuple[float, float, float], Range(0, 1)] = (0.0, 0.0, 0.0)
-    random_background: bool = False
+    random_background: bool = True
     antialiased: bool = False
     near: Amount = 0.0
     deterministic: bool = False

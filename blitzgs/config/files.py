@@ -17,7 +17,7 @@ from typing import Any
 
 import yaml
 
-from blitzgs.config.fields import FORK, POSITION_LEFT, SH_SHARE, Config
+from blitzgs.config.fields import FORK, POSITION_LEFT, SH_SHARE, Config, LossConfig
 from blitzgs.config.fields import ConfigError as ConfigError
 from blitzgs.config.ranges import flat as flat
 from blitzgs.config.ranges import problems
@@ -221,6 +221,8 @@ def _build(kind: type, values: Any, where: str) -> Any:
         raise ConfigError(
             f"{where or 'configuration'}: must be a section with {', '.join(hints)}; got {values!r}"
         )
+    if where == "loss":
+        values = _in_todays_unit(values)
     arguments = {}
     for name, value in values.items():
         path = f"{where}.{name}" if where else str(name)
@@ -237,6 +239,14 @@ def _build(kind: type, values: Any, where: str) -> Any:
             raise ConfigError(f"{path}: unknown field; {_hint(str(name), list(hints))}")
         arguments[name] = _convert(hints[name], value, path)
     return kind(**arguments)
+
+
+def _in_todays_unit(loss: dict[str, Any]) -> dict[str, Any]:
+    """Convert `loss.scale` of an earlier version, whose unit was the field `scale_reference`."""
+    unit, scale = loss.get("scale_reference"), loss.get("scale", LossConfig.scale)
+    if not (isinstance(unit, (int, float)) and unit > 0 and isinstance(scale, (int, float))):
+        return loss
+    return {**loss, "scale_reference": 10.0, "scale": scale * 10.0 / unit}
 
 
 def without_effect(name: str, value: Any, values: Mapping[str, Any]) -> bool:

@@ -156,6 +156,13 @@ def test_a_removed_field_is_named_unless_it_had_no_effect():
     assert not set(REMOVED) & set(FIELDS)
 
 
+def test_the_unit_of_the_scale_term_in_earlier_versions():
+    assert load_config(None, ["loss.scale=6", "loss.scale_reference=3"]).loss.scale == 20
+    assert from_dict({"loss": {"scale_reference": 4.0}}).loss.scale == 2.5 * Config().loss.scale
+    with pytest.raises(ConfigError, match="loss.scale_reference: this field was removed"):
+        load_config(None, ["loss.scale_reference=0"])
+
+
 def test_every_number_has_a_range_and_every_default_lies_in_it():
     assert sorted(name for name, _ in NUMBERS) == sorted(RANGES)
     assert list(problems(Config())) == []
