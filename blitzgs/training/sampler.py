@@ -20,6 +20,8 @@ from blitzgs.table.blocks import morton_order
 # A view moves by up to this share of a tour, see `BatchSampler`. The views of such a piece should see no more
 # Gaussians than the device holds: an eighth of a survey sees about a fifth of its Gaussians.
 _PIECE = 0.125
+# Steps whose random colours are drawn together: one call takes as long for all as for one.
+_DRAWN = 256
 
 
 class BatchSampler:
@@ -64,6 +66,7 @@ class BatchSampler:
         self._epoch = lru_cache(maxsize=2 * len(groups))(self._make_epoch)
         # Who looks ahead asks for this round and the next one in turn.
         self._batches_of = lru_cache(maxsize=2)(self._make_round)
+        self._colours = lru_cache(maxsize=2)(self._draw)
 
     def batch(self, step: int) -> list[int]:
         """Return the B views of a step (0-based); a view repeats only where its group's epochs meet."""
@@ -81,7 +84,11 @@ class BatchSampler:
 
     def backgrounds(self, step: int) -> Tensor:
         """Return a random colour for each view of a step (0-based), float64 [B, 3] in (0, 1)."""
-        return uniform(torch.arange(3 * self.batch_size), self._seed, step, 3).view(-1, 3)
+        block, place = divmod(step, _DRAWN)
+        return self._colours(block)[place]
+
+    def _draw(self, block: int) -> Tensor:
+        return uniform(torch.arange(_DRAWN * 3 * self.batch_size), self._seed, block, 3).view(_DRAWN, -1, 3)
 
     def _group_batches(self, size: int, rounds: int) -> int:
         return rounds * size // self.batch_size
