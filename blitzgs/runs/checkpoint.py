@@ -182,9 +182,11 @@ def newest(
     `directory`: folder given to `Saving`. `read`: reads a checkpoint; refuses it on every rank, with a
     CheckpointError. `only`: name of the one checkpoint to read; None: the newest. Returns what `read`
     returned, the checkpoint, and why each newer one was refused; None if the folder has no checkpoint.
-    CheckpointError: checkpoints exist, but none is sound.
+    CheckpointError: checkpoints exist, but none is sound, or none has the name.
     """
     found = ranks.broadcast_object(names_of(directory) if ranks.rank == 0 else [])
+    if only is not None and only not in found:
+        raise CheckpointError(f"{directory} has no checkpoint {only!r}; it has {', '.join(found) or 'none'}")
     refused: list[str] = []
     for name in reversed(found) if only is None else [only]:
         try:
@@ -195,6 +197,8 @@ def newest(
         if refused and ranks.rank == 0:
             warn(f"{'; '.join(refused)}; using {name}")
         return content, directory / name, refused
+    if refused and ranks.broadcast_object(names_of(directory) if ranks.rank == 0 else []) != found:
+        return newest(directory, ranks, read, only)  # a training has replaced them meanwhile
     if refused:
         raise CheckpointError(f"no sound checkpoint in {directory}: {'; '.join(refused)}")
     return None

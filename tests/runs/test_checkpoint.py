@@ -120,6 +120,19 @@ def test_each_damaged_checkpoint_is_named_once(tmp_path):
         assert str(failure.value).count(path.name) == 1
 
 
+def test_a_checkpoint_that_is_replaced_while_it_is_read_is_not_damaged(tmp_path):
+    old = save_checkpoint(tmp_path, table(5), {"iteration": 1}, ALONE, keep=1)
+
+    def read(path):
+        if path == old:  # as slow as a training that meanwhile saves its next checkpoint
+            save_checkpoint(tmp_path, table(5), {"iteration": 2}, ALONE, keep=1)
+        return checkpoint.load(path, ALONE, "cpu")
+
+    assert checkpoint.newest(tmp_path, ALONE, read)[0].state == {"iteration": 2}
+    with pytest.raises(checkpoint.CheckpointError, match="no checkpoint 'last'; it has checkpoint_000001$"):
+        checkpoint.newest(tmp_path, ALONE, read, "last")
+
+
 def _save_and_die(directory, calls):
     """Save, and end before call number `calls` of the system that makes, names or syncs a file or folder."""
     left = iter(range(calls))
