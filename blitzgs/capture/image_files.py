@@ -241,6 +241,16 @@ def check_photograph(path: Path) -> bool:
     return True
 
 
+def is_opaque(path: Path) -> bool:
+    """Tell whether every pixel of a photograph is opaque. ValueError: it cannot be decoded."""
+    file = read_whole(path)
+    if not file.header["alpha"]:
+        return True
+    pixels = _imdecode(file, cv2.IMREAD_UNCHANGED)
+    has_alpha = pixels.ndim == 3 and pixels.shape[2] == 4
+    return not has_alpha or bool((pixels[..., 3] >= _full(pixels, file.header)).all())
+
+
 def _full(pixels: npt.NDArray[Any], header: dict[str, Any]) -> float:
     """Return the number that stands for white or opaque."""
     if pixels.dtype.kind == "f":

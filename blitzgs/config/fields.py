@@ -97,7 +97,8 @@ class ModelConfig:
         background: colour behind everything, RGB in [0, 1].
         random_background: each training view has a random colour behind everything instead, so that
             Gaussians have to cover all that photographs show; otherwise places of the background's colour
-            stay transparent. No effect if photographs have alpha, which are composited over `background`.
+            stay transparent. No effect if photographs are transparent, which are composited over
+            `background`.
         antialiased: scale opacities to compensate the screen-space blur (Mip-Splatting's 2D filter); false:
             classic 3DGS.
         near: near plane, relative to extent. 0: a quarter of the depth of the nearest points that training

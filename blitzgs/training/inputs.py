@@ -10,10 +10,11 @@ import os
 import socket
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 
 import blitzgs
+from blitzgs.capture import image_files
 from blitzgs.capture.capture import Capture, MissingImagesError, capture_fingerprint, load_capture
 from blitzgs.capture.images import ImageStore, decoded_shapes
 from blitzgs.capture.masks import FindDamage, damaged
@@ -27,6 +28,8 @@ from blitzgs.view.views import Space
 HOST_FIELDS = ("data.path", "data.cache_bytes")
 # The least width and height of reduced photographs: a window of SSIM has 11 pixels.
 LEAST_SIDE = 11
+# Photographs whose alpha is looked at before training.
+_LOOKED_AT = 8
 # The largest memory of a container in bytes, or "max" (Linux, control groups 2).
 _CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
@@ -156,6 +159,17 @@ def check_capture(space: Space, capture: Capture, folder: Path) -> None:
     """
     if Space.of(capture.offset, capture.extent) != space:
         raise ValueError(f"{capture.root} is not the capture of the run in {folder}: its cameras differ")
+
+
+@lru_cache(maxsize=1)
+def is_opaque(capture: Capture) -> bool:
+    """Tell whether training photographs, of which some are decoded, show something in every pixel."""
+    some = capture.train[:: -(-len(capture.train) // _LOOKED_AT)] if capture.has_alpha else []
+    for index in some:
+        with contextlib.suppress(OSError, ValueError):  # a damaged one is left to the reader that needs it
+            if not image_files.is_opaque(capture.cameras[index].image_path):
+                return False
+    return True
 
 
 def check_resolution(config: Config, capture: Capture) -> None:

@@ -34,6 +34,7 @@ from blitzgs.training.batches import MAX_MASKED, BatchLoader
 from blitzgs.training.budget import Budget
 from blitzgs.training.events import evaluate, handle_all, save
 from blitzgs.training.events.evaluate import Glances
+from blitzgs.training.inputs import is_opaque
 from blitzgs.training.records import (
     describe,
     log_step,
@@ -70,6 +71,7 @@ class Trainer:
     ) -> None:
         """Set up the run; `laps` goes on until the first step; others as for `training.setup.set_up`."""
         begin, self._laps = time.monotonic(), laps or Laps()
+        random_background = config.model.random_background and ranks.rank == 0 and is_opaque(capture)
         self.state = state = set_up(config, capture, images, folder, ranks, resume, extend, self._laps.lap)
         state.add_stage("setup", time.monotonic() - begin)
         self.warned: list[str] = []  # texts of warnings, which the log takes over at the end
@@ -81,7 +83,7 @@ class Trainer:
             state.sampler,
             ranks.device,
             owners=state.owners if ranks.world_size > 1 else None,
-            random_background=config.model.random_background and not capture.has_alpha,
+            random_background=ranks.broadcast_object(random_background),
         )
         self._guard = LossGuard()
         self._warned_of_masks = False

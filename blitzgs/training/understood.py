@@ -15,7 +15,7 @@ from blitzgs.capture.lengths import NEAR_OF_EXTENT, depths_seen, sampled
 from blitzgs.config.fields import Config
 from blitzgs.config.schedule import Schedule, stretched
 from blitzgs.population.density import growth_limit
-from blitzgs.training.inputs import sharing_hint
+from blitzgs.training.inputs import is_opaque, sharing_hint
 from blitzgs.training.state import TrainingState
 from blitzgs.util.errors import printable, warn
 
@@ -200,6 +200,8 @@ def _alpha(capture: Capture, config: Config) -> str:
     colour = ", ".join(f"{value:g}" for value in config.model.background)
     about = capture.about
     extra = f"; a further band of {about.extra_bands} is not used" if about.extra_bands else ""
+    if is_opaque(capture):
+        return f"{about.with_alpha} photographs have it, and are opaque{extra}"
     if config.model.random_background:
         extra += "; model.random_background has no effect"
     return f"{about.with_alpha} photographs have it; composited over model.background ({colour}){extra}"

@@ -57,7 +57,7 @@ class Camera:
     )
 
 
-@dataclass
+@dataclass(eq=False)
 class Capture:
     cameras: list[Camera]
     points: np.ndarray
