@@ -34,6 +34,9 @@ class Format:
     states: tuple[str, ...] = ()  # what its viewers find in the file besides the Gaussians
     harmonics: bool = True  # whether it holds SH coefficients beyond the DC
     quantised: bool = True  # whether positions are finer near the origin than float32 makes them
+    # Tells which Gaussians its ranges change, bool [N]; and how it changes them.
+    cut: Callable[[Gaussians], torch.Tensor] | None = None
+    cut_to: str = ""
 
     def unstated(self, source: GaussianSource) -> list[str]:
         """Return what a viewer of the file will not know of a model, each a sentence without a full stop."""
@@ -47,6 +50,8 @@ class Format:
             lost.append(f"{self.title} has no octree levels: viewers show all Gaussians")
         if source.degree > 0 and not self.harmonics:
             lost.append(f"{self.title} holds one colour a Gaussian: colours that depend on the view are lost")
+        if self.cut is not None and (count := sum(int(self.cut(block).sum()) for block in source.blocks())):
+            lost.append(f"{self.title} holds {self.cut_to}: {count:,} Gaussians became smaller or darker")
         return lost
 
 
@@ -61,7 +66,8 @@ FORMATS = {
     ),
     "splat": Format(".splat", ".splat", packed.read_splat, packed.write_splat, harmonics=False),
     "spz": Format(
-        "SPZ", ".spz", packed.read_spz, packed.write_spz, (b"\x1f\x8b", b"NGSP"), ("antialiasing",)
+        "SPZ", ".spz", packed.read_spz, packed.write_spz, (b"\x1f\x8b", b"NGSP"), ("antialiasing",),
+        cut=packed.cut_by_spz, cut_to="scales to 379 units and colours to 1.44 of white",
     ),
     "sog": Format("SOG", ".sog", read_sog, write_sog, (b"PK",), ("antialiasing",)),
     "glb": Format("GLB", ".glb", None, write_glb, (b"glTF",), ("levels",), quantised=False),

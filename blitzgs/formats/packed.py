@@ -302,6 +302,11 @@ def write_spz(path: Path, source: GaussianSource) -> None:
             shutil.copyfileobj(file, packed, 1 << 20)
 
 
+def cut_by_spz(model: Gaussians) -> torch.Tensor:
+    """Tell which Gaussians are larger or brighter than the bytes of SPZ can say, bool [N]."""
+    return (model.scales > 255.5 / 16 - 10).any(dim=1) | (model.sh[:, 0] > 0.5 / 0.15).any(dim=1)
+
+
 def read_spz(path: Path) -> Gaussians:
     """Read an SPZ file of version 1 to 4 (ValueError: the file is damaged; names the file and the reason)."""
     with open(path, "rb") as file:

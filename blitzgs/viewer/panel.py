@@ -28,7 +28,7 @@ MOTIONS = {
     "fly": "**Fly**: drag turns your head.",
     "walk": "**Walk**: drag turns your head, at eye height above the ground.",
 }
-KEYS = "Keys: W A S D move level, Q down, E up, arrows turn. Click a frustum to stand there."
+KEYS = "Keys: W A S D move level, Q down, E up, arrows turn."
 
 
 class Panel:
@@ -133,7 +133,8 @@ class Panel:
             tell()
 
         def tell() -> None:  # the buttons do not show which is chosen
-            help_text.content = f"{MOTIONS[visitor.motion]} {KEYS}"
+            click = " Click a frustum to stand there." if self._exhibit.cameras else ""
+            help_text.content = f"{MOTIONS[visitor.motion]} {KEYS}{click}"
 
         motion.on_click(moves)
         tell()

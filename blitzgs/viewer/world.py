@@ -117,8 +117,8 @@ def up_direction(poses: Sequence[Array]) -> Array:
     """Guess which direction is up from the cameras' poses, each world to camera [4, 4].
 
     Cameras that look around stand upright, so the mean of their up vectors is up. Cameras that look down from
-    above are turned in all directions, so their mean direction of view is down. The z axis is taken if it is
-    near either, or if nothing is known.
+    above turn about their view, so its mean is down, even where most fly in one direction. Taken is the mean
+    in which they agree more, or the z axis if it is near either, or if nothing is known.
     """
     z = np.array([0.0, 0.0, 1.0])
     if not poses:
@@ -129,7 +129,7 @@ def up_direction(poses: Sequence[Array]) -> Array:
         length = float(np.linalg.norm(guess))
         if length > 0.3 and guess @ z / length > _NEAR_Z:
             return z
-    best = upright if np.linalg.norm(upright) > 0.5 else backward
+    best = max(upright, backward, key=np.linalg.norm)
     length = float(np.linalg.norm(best))
     return best / length if length > 1e-3 else z
 

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from blitzgs.formats import packed
-from blitzgs.formats.gaussians import MIP, Gaussians
+from blitzgs.formats.gaussians import MIP, SH_C0, Gaussians
 from blitzgs.formats.models import FORMATS, check_replaces, read_gaussians, with_degree
 from blitzgs.runs.world import rotated_harmonics
 from tests.helpers import refused, some_gaussians
@@ -223,6 +223,16 @@ def test_what_a_format_cannot_say_is_told(model):
         told = " ".join(format_.unstated(replace(with_levels, comments=[MIP])))
         assert ("antialiased" in told) == (name in ("splat", "glb")), name
         assert ("octree levels" in told) == (name not in ("ply", "glb")), name
+
+
+def test_gaussians_beyond_the_ranges_of_spz_are_told(tmp_path):
+    model = some_gaussians(9, 0)
+    assert not FORMATS["spz"].unstated(model)
+    model.scales[0, 1], model.sh[1:3, 0, 2] = 7.0, 4.0
+    assert "3 Gaussians" in (told := " ".join(FORMATS["spz"].unstated(model)))
+    found = read_gaussians(written(tmp_path, "spz", model))
+    assert f"{found.scales[0, 1].exp():.0f} units" in told
+    assert f"{0.5 + SH_C0 * found.sh[1, 0, 2]:.2f} of white" in told
 
 
 def test_no_file_of_another_format_is_replaced(tmp_path):

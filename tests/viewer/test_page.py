@@ -248,7 +248,9 @@ def test_a_ply_file_behind_a_token(trained, tmp_path):
         with Browser(url) as browser:
             settled(studio)
             wait_for(lambda: picture(browser).std() > 5, 60, "the picture is on the page")
-            assert browser.errors() == []
+            text = "document.body.innerText"
+            wait_for(lambda: "Keys: W A S D" in browser.evaluate(text), 20, "the help is there")
+            assert browser.errors() == [] and "frustum" not in browser.evaluate(text)
 
 
 def test_the_live_page_follows_a_training(tmp_path, monkeypatch):

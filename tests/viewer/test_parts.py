@@ -44,6 +44,11 @@ def test_up_is_found_for_ground_and_aerial_captures():
     np.testing.assert_allclose(up_direction(ring), [0, -1, 0], atol=0.2)
     nadir = [camera_at((x, y, 10.0), (x, y, 0.0), (0, (-1) ** x, 0)) for x in range(4) for y in range(3)]
     np.testing.assert_allclose(up_direction(nadir), [0, 0, 1])
+    # Five of six lines fly one way, and z is down, as in the world of COLMAP's first camera.
+    survey = [
+        camera_at((x, y, -9), (x + y / 9, y, 0), (0, -1 if x else 1, 0)) for x in range(6) for y in range(3)
+    ]
+    np.testing.assert_allclose(up_direction(survey), [0, 0, -1], atol=0.2)
     np.testing.assert_allclose(up_direction([]), [0, 0, 1])
 
 

@@ -101,6 +101,10 @@ def test_a_budget_is_kept_and_missing_tiles_are_said(shown):
     finally:
         tileset.write_text(content)
 
+    browser.call("Page.navigate", url=(folder / "city" / "index.html").as_uri())
+    said = "document.getElementById('message')?.textContent"
+    wait_for(lambda: "blitzgs view" in (browser.evaluate(said) or ""), 30, "the disk is no server")
+
 
 def test_damaged_folders_are_refused(tmp_path):
     folder = tmp_path / "city"

@@ -225,6 +225,7 @@
   }
 
   const ready = open();
-  ready.catch((error) => fail(`The tiles cannot be shown: ${error.message}`));
+  const remedy = location.protocol === "file:" ? "; tiles need a web server, such as blitzgs view FOLDER" : "";
+  ready.catch((error) => fail(`The tiles cannot be shown: ${error.message}${remedy}`));
   window.blitzgs = { ready, state, settle };
 })();
