@@ -221,8 +221,8 @@ def _build(kind: type, values: Any, where: str) -> Any:
         raise ConfigError(
             f"{where or 'configuration'}: must be a section with {', '.join(hints)}; got {values!r}"
         )
-    if where == "loss":
-        values = _in_todays_unit(values)
+    if not where:
+        values = _as_meant(values)
     arguments = {}
     for name, value in values.items():
         path = f"{where}.{name}" if where else str(name)
@@ -241,12 +241,18 @@ def _build(kind: type, values: Any, where: str) -> Any:
     return kind(**arguments)
 
 
-def _in_todays_unit(loss: dict[str, Any]) -> dict[str, Any]:
-    """Convert `loss.scale` of an earlier version, whose unit was the field `scale_reference`."""
-    unit, scale = loss.get("scale_reference"), loss.get("scale", LossConfig.scale)
-    if not (isinstance(unit, (int, float)) and unit > 0 and isinstance(scale, (int, float))):
-        return loss
-    return {**loss, "scale_reference": 10.0, "scale": scale * 10.0 / unit}
+def _as_meant(values: dict[str, Any]) -> dict[str, Any]:
+    """Convert a configuration of a version with `loss.scale_reference`, which had no random backgrounds.
+
+    That field was the unit of `loss.scale`.
+    """
+    loss, model = values.get("loss"), values.get("model", {})
+    if not (isinstance(loss, dict) and "scale_reference" in loss and isinstance(model, dict)):
+        return values
+    unit, scale = loss["scale_reference"], loss.get("scale", LossConfig.scale)
+    if isinstance(unit, (int, float)) and unit > 0 and isinstance(scale, (int, float)):
+        loss = {**loss, "scale_reference": 10.0, "scale": scale * 10.0 / unit}
+    return {**values, "loss": loss, "model": {"random_background": False, **model}}
 
 
 def without_effect(name: str, value: Any, values: Mapping[str, Any]) -> bool:

@@ -13,7 +13,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from blitzgs.cli import main
-from blitzgs.config.fields import Config
+from blitzgs.config.fields import Config, ModelConfig
 from blitzgs.config.files import (
     REMOVED,
     ConfigError,
@@ -161,6 +161,12 @@ def test_the_unit_of_the_scale_term_in_earlier_versions():
     assert from_dict({"loss": {"scale_reference": 4.0}}).loss.scale == 2.5 * Config().loss.scale
     with pytest.raises(ConfigError, match="loss.scale_reference: this field was removed"):
         load_config(None, ["loss.scale_reference=0"])
+
+
+def test_backgrounds_of_earlier_versions_are_not_random():
+    saved = {"loss": {"scale_reference": 10.0}, "model": {"antialiased": True}}
+    assert from_dict(saved).model == ModelConfig(antialiased=True, random_background=False)
+    assert load_config(None, ["loss.scale_reference=10", "model.random_background=true"]) == Config()
 
 
 def test_every_number_has_a_range_and_every_default_lies_in_it():
