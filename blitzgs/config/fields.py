@@ -97,7 +97,8 @@ class ModelConfig:
         background: colour behind everything, RGB in [0, 1].
         random_background: each training view has a random colour behind everything instead, so that
             Gaussians have to cover all that photographs show; otherwise places of the background's colour
-            stay transparent. No effect if photographs are transparent, which are composited over
+            stay transparent. Gaussians larger than the scene then close views from behind, and cover it from
+            the side (docs/decisions.md). No effect if photographs are transparent, which are composited over
             `background`.
         antialiased: scale opacities to compensate the screen-space blur (Mip-Splatting's 2D filter); false:
             classic 3DGS.
@@ -115,7 +116,7 @@ class ModelConfig:
 
     sh_degree: Annotated[int, Range(0, 3)] = 3
     background: Annotated[tuple[float, float, float], Range(0, 1)] = (0.0, 0.0, 0.0)
-    random_background: bool = True
+    random_background: bool = False
     antialiased: bool = False
     near: Amount = 0.0
     deterministic: bool = False

@@ -248,7 +248,13 @@ class Watchdog:
             self._publish()
 
     def _run(self) -> None:
+        last = time.monotonic()
         while not self.stopping.wait(self.period):
+            last, before = time.monotonic(), last
+            if last - before > self.period + PATIENCE_SECONDS / 2:
+                # The host has stopped this process, perhaps the whole job, and now continues it.
+                self._excused = last
+                self._heard = {rank: (stamp, last) for rank, (stamp, _) in self._heard.items()}
             try:
                 self._publish()
                 since = self.waiting_since

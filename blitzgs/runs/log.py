@@ -199,7 +199,8 @@ class RunLog:
 
     def _draw(self, t: int, values: Mapping[str, float]) -> None:
         """Add numbers to TensorBoard's events."""
-        if self._board is None:
+        # Where the log file has no space, each writer's thread would end with a traceback on the terminal.
+        if self._board is None or self._waiting:
             return
         with self._tolerated("TensorBoard"):
             from torch.utils.tensorboard import SummaryWriter

@@ -187,8 +187,8 @@ def check_resolution(config: Config, capture: Capture) -> None:
         )
 
 
-def check_alike(config: Config, capture: Capture, ranks: Ranks, resume: bool) -> None:
-    """Check that all ranks run the same code with the same configuration and flag on the same capture.
+def check_alike(config: Config, capture: Capture, ranks: Ranks, resume: bool, extend: float | None) -> None:
+    """Check that all ranks run the same code with the same configuration and flags on the same capture.
 
     MismatchError: on every rank, naming the field and the ranks.
     """
@@ -199,9 +199,9 @@ def check_alike(config: Config, capture: Capture, ranks: Ranks, resume: bool) ->
         for name, value in flat(to_dict(config)).items()
         if name not in HOST_FIELDS
     }
+    flags = {"flag --resume": resume, "flag --extend": extend}
     ranks.compare_across_ranks(
-        {"code version": code_fingerprint(), "capture": capture_fingerprint(capture), "flag --resume": resume}
-        | fields
+        {"code version": code_fingerprint(), "capture": capture_fingerprint(capture)} | flags | fields
     )
 
 

@@ -119,9 +119,13 @@ def _mean_over_visible(frame: Frame, values: Tensor) -> Tensor:
     return sums / frame.visible.clamp(min=1)
 
 
-def batch_psnr(frame: Frame, batch: Batch) -> Tensor:
-    """Return the PSNR of a batch in dB, over all pixels that are not masked; nan if all are masked."""
-    error = ((frame.renders.clamp(0, 1) - batch.targets.float() / 255.0) ** 2).sum(-1)
+def batch_psnr(frame: Frame, batch: Batch, shown: Tensor | None = None) -> Tensor:
+    """Return the PSNR of a batch in dB, over all pixels that are not masked; nan if all are masked.
+
+    `shown`: as for `loss_terms`.
+    """
+    shown = frame.renders if shown is None else shown
+    error = ((shown.clamp(0, 1) - batch.targets.float() / 255.0) ** 2).sum(-1)
     if batch.masks is not None:
         error *= batch.masks != 0
     if frame.assignment is not None:

@@ -129,7 +129,11 @@ def measure_step(state: TrainingState, frame: Frame, batch: Batch) -> HostCopy:
         scale = scale_term(frame, table, extent * SCALE_UNIT).mean()
     if loss.opacity > 0:
         opacity = opacity_term(frame, table).mean()
-    terms = torch.stack([scale, opacity, batch_psnr(frame, batch)])
+    shown = None
+    if (exposures := state.stepper.exposures) is not None:  # as the loss compares them
+        gains, biases = exposures.of(batch.indices)
+        shown = torch.addcmul(biases, frame.renders, gains)
+    terms = torch.stack([scale, opacity, batch_psnr(frame, batch, shown)])
     figures = torch.cat([counts.double(), terms.double(), batch.samples.double()])
     return HostCopy(figures.view(torch.int64))
 

@@ -79,7 +79,7 @@ def set_up(
     # Everything that may refuse the run comes before the first file is written, so that a refused run leaves
     # its folder as it was. The ranks are compared before they work together, and the folder is checked before
     # a checkpoint is read from it.
-    check_alike(config, capture, ranks, resume)
+    check_alike(config, capture, ranks, resume, extend)
     check_resolution(config, capture)
     check_unclaimed(folder, resume)
     check_writable(folder / run_files.CHECKPOINTS, ranks)

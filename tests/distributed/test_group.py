@@ -3,6 +3,7 @@
 
 import os
 import signal
+import subprocess
 import time
 
 import pytest
@@ -171,6 +172,20 @@ def test_a_rank_that_is_at_work_is_waited_for():
     with pytest.raises(RankError) as failure:
         run_ranks(_work, 2, True, timeout_seconds=3.0, limit=60, stuck={1})
     assert "rank 1 has not arrived (last collective: barrier" in failure.value.blame
+
+
+def _pause(ranks):
+    watchdog.PATIENCE_SECONDS = 3.0
+    both = " ".join(map(str, ranks.all_gather_object(os.getpid())))
+    if ranks.rank == 0:
+        subprocess.Popen(["sh", "-c", f"sleep 1; kill -STOP {both}; sleep 7; kill -CONT {both}"])
+        time.sleep(2)
+        time.sleep(1)  # rank 1 still waits after the pause
+    return ranks.all_reduce(torch.ones(1)).item()
+
+
+def test_a_job_that_was_stopped_and_continued_goes_on():
+    assert run_ranks(_pause, 2, timeout_seconds=4.0, limit=60) == [2.0, 2.0]
 
 
 def test_memory_is_extended_in_place_unless_the_user_has_configured_it(monkeypatch):

@@ -22,6 +22,7 @@ from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import run_files, trained_model
 from blitzgs.training.events import densify
+from blitzgs.training.trainer import Trainer
 from tests.distributed.rank_harness import EIGHT, all_fail, on_each_device, run_ranks
 from tests.training.tiny import (
     OVERRIDES,
@@ -35,6 +36,7 @@ from tests.training.tiny import (
     sorted_rows,
     steps_of,
     stop_at,
+    tiny_config,
     tiny_scene,
 )
 
@@ -127,11 +129,17 @@ def _resume_on_one_rank(ranks, folder):
     make_trainer(folder, *SETTINGS, ranks=ranks, resume=ranks.rank == 1)
 
 
+def _extend_on_one_rank(ranks, folder):
+    extend = 2.0 if ranks.rank == 1 else None
+    Trainer(tiny_config(*SETTINGS), *tiny_scene(), folder, ranks, True, extend)
+
+
 @pytest.mark.parametrize(
     ("run", "text"),
     [
         (_train_with_rank_config, r"configuration field loss\.ssim: rank 0 \(.*\): 0\.1; rank 1 \("),
         (_resume_on_one_rank, r"flag --resume: rank 0 \(.*\): False; rank 1 \("),
+        (_extend_on_one_rank, r"flag --extend: rank 0 \(.*\): None; rank 1 \("),
     ],
 )
 def test_what_the_ranks_disagree_on_is_named(tmp_path, run, text):

@@ -289,6 +289,7 @@ def test_a_log_that_cannot_be_written_ends_nothing(tmp_path, monkeypatch):
 
     class FullBoard:
         def __init__(self, folder, purge_step=None):
+            assert not (tmp_path / "log.jsonl").is_dir(), "a writer is made while records wait"
             Path(folder).mkdir(exist_ok=True)
 
         def add_scalar(self, *args):

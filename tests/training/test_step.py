@@ -2,6 +2,8 @@
 """A step of the trainer, and the exposures of photographs."""
 
 import json
+import pkgutil
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -239,6 +241,19 @@ def train_on_unequal_photographs(folder, resume=False):
     ]
     options = ("model.exposure=true", "population.strategy=relocation")
     return train(folder, *options, scene=scene, resume=resume)
+
+
+def test_the_training_psnr_is_that_of_the_images_of_the_loss(tmp_path, monkeypatch):
+    compared = []
+
+    def call(function, *args):
+        compared.append(args[-1].clone())
+        return function(*args)
+
+    for path in ("blitzgs.training.step.loss_terms", "blitzgs.training.records.batch_psnr"):
+        monkeypatch.setattr(path, partial(call, pkgutil.resolve_name(path)))
+    train_on_unequal_photographs(tmp_path)
+    assert torch.equal(*compared[-2:])  # of the last step, which is logged
 
 
 def test_a_resumed_run_repeats_every_bit_and_a_render_shows_the_exposures(tmp_path):
