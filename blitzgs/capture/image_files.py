@@ -235,10 +235,8 @@ def check_photograph(path: Path) -> bool:
     header = file.header
     if header["format"] in ("JPEG", "PNG") and not header["alpha"]:
         return True
-    pixels = _imdecode(file, cv2.IMREAD_UNCHANGED)
-    if header["alpha"] and pixels.ndim == 3 and pixels.shape[2] == 4:
-        return bool(pixels[..., 3].any())
-    return True
+    alpha = _alpha(_imdecode(file, cv2.IMREAD_UNCHANGED), header)
+    return alpha is None or bool(alpha.any())
 
 
 def is_opaque(path: Path) -> bool:
@@ -247,8 +245,13 @@ def is_opaque(path: Path) -> bool:
     if not file.header["alpha"]:
         return True
     pixels = _imdecode(file, cv2.IMREAD_UNCHANGED)
-    has_alpha = pixels.ndim == 3 and pixels.shape[2] == 4
-    return not has_alpha or bool((pixels[..., 3] >= _full(pixels, file.header)).all())
+    alpha = _alpha(pixels, file.header)
+    return alpha is None or bool((alpha >= _full(pixels, file.header)).all())
+
+
+def _alpha(pixels: npt.NDArray[Any], header: dict[str, Any]) -> npt.NDArray[Any] | None:
+    """Return the alpha of decoded pixels, [H, W]; None: the file does not say that a band is alpha."""
+    return pixels[..., 3] if header["alpha"] and pixels.ndim == 3 and pixels.shape[2] == 4 else None
 
 
 def _full(pixels: npt.NDArray[Any], header: dict[str, Any]) -> float:
@@ -292,9 +295,8 @@ def decode_mask(file: ImageFile) -> UInt8:
     full = _full(pixels, header)
     if header["is_white_zero"] and pixels.dtype == np.uint16:  # which OpenCV turns round for 8 bits only
         pixels = np.asarray(np.iinfo(np.uint16).max - pixels)
-    opaque = None
-    if pixels.ndim == 3 and pixels.shape[2] == 4 and header["alpha"]:
-        opaque = pixels[..., 3] * 2.0 >= full
+    alpha = _alpha(pixels, header)
+    opaque = None if alpha is None else alpha * 2.0 >= full
     if pixels.ndim == 3:
         pixels = pixels[..., :3].max(axis=2)
     counted = pixels > _black(pixels, full, header["is_lossy"])

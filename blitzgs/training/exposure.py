@@ -66,6 +66,11 @@ class Exposures:
         chosen = self.effective()[[self._rows[index] for index in indices]].float()
         return chosen[:, 0, None, None], chosen[:, 1, None, None]
 
+    def shown(self, renders: Tensor, indices: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Return renders [B, H, W, 3] of training views as their photographs show them, and the gains."""
+        gains, biases = self.of(indices)
+        return torch.addcmul(biases, renders, gains), gains
+
     def measure(self, step: int, renders: Tensor, batch: Batch) -> None:
         """Measure a batch's photographs, in one step of `_EVERY`, by renders [B, H, W, 3]. Collective."""
         if step % _EVERY:

@@ -131,8 +131,7 @@ def measure_step(state: TrainingState, frame: Frame, batch: Batch) -> HostCopy:
         opacity = opacity_term(frame, table).mean()
     shown = None
     if (exposures := state.stepper.exposures) is not None:  # as the loss compares them
-        gains, biases = exposures.of(batch.indices)
-        shown = torch.addcmul(biases, frame.renders, gains)
+        shown, _ = exposures.shown(frame.renders, batch.indices)
     terms = torch.stack([scale, opacity, batch_psnr(frame, batch, shown)])
     figures = torch.cat([counts.double(), terms.double(), batch.samples.double()])
     return HostCopy(figures.view(torch.int64))

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import torch
 from torch import Tensor
 
 from blitzgs.distributed.host_sum import HostSum
@@ -110,8 +109,7 @@ class Stepper:
             terms = loss_terms(frame, batch, self._loss, self._extent)
         else:
             self.exposures.measure(step, frame.renders, batch)
-            gains, biases = self.exposures.of(batch.indices)
-            shown = torch.addcmul(biases, frame.renders, gains)
+            shown, gains = self.exposures.shown(frame.renders, batch.indices)
             terms = loss_terms(frame, batch, self._loss, self._extent, shown)
             terms.v_renders.mul_(gains)
         stage_ended("loss")

@@ -200,9 +200,7 @@ def _alpha(capture: Capture, config: Config) -> str:
     colour = ", ".join(f"{value:g}" for value in config.model.background)
     about = capture.about
     extra = f"; a further band of {about.extra_bands} is not used" if about.extra_bands else ""
-    if is_opaque(capture):
-        return f"{about.with_alpha} photographs have it, and are opaque{extra}"
-    if config.model.random_background:
+    if config.model.random_background and not is_opaque(capture):
         extra += "; model.random_background has no effect"
     return f"{about.with_alpha} photographs have it; composited over model.background ({colour}){extra}"
 
