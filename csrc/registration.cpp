@@ -243,6 +243,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "position_noise_(Tensor(a!) means, Tensor quats, Tensor scales, Tensor opacities, Tensor ids, Tensor "
       "visible_ids, int seed, int step, float threshold, float strength) -> ()");
+  // A limit of the size of Gaussians.
+  m.def(
+      "limit_scales_(Tensor(a!) scales, Tensor means, Tensor visible_ids, float share, float extent) -> ()");
 
   // Relocation: weights of a draw; the whole draws of each row, and keys for the rest; what N Gaussians at
   // one place composite; and rows that stand for `copies` Gaussians from now on. moments: Adam's first

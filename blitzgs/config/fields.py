@@ -94,12 +94,12 @@ class ModelConfig:
 
     Attributes:
         sh_degree: highest spherical-harmonics degree, 0..3.
-        background: colour behind everything, RGB in [0, 1].
+        background: colour behind everything, RGB in [0, 1], also behind transparent photographs. null: black,
+            or with `random_background` the mean colour of the photographs; the run's own configuration has
+            the result.
         random_background: each training view has a random colour behind everything instead, so that
             Gaussians have to cover all that photographs show; otherwise places of the background's colour
-            stay transparent. Gaussians larger than the scene then close views from behind, and cover it from
-            the side (docs/decisions.md). No effect if photographs are transparent, which are composited over
-            `background`.
+            stay transparent. No effect if photographs are transparent.
         antialiased: scale opacities to compensate the screen-space blur (Mip-Splatting's 2D filter); false:
             classic 3DGS.
         near: near plane, relative to extent. 0: a quarter of the depth of the nearest points that training
@@ -115,7 +115,7 @@ class ModelConfig:
     """
 
     sh_degree: Annotated[int, Range(0, 3)] = 3
-    background: Annotated[tuple[float, float, float], Range(0, 1)] = (0.0, 0.0, 0.0)
+    background: Annotated[tuple[float, float, float] | None, Range(0, 1)] = None
     random_background: bool = False
     antialiased: bool = False
     near: Amount = 0.0
@@ -135,6 +135,9 @@ class LodConfig:
 
     visible_threshold: Annotated[float, Range(0, 1, high_open=True)] = 0.9
 
+
+# The background that `ModelConfig.background` stands for where nothing else is said.
+BLACK = (0.0, 0.0, 0.0)
 
 # Ratio f of the voxel sizes of neighbouring octree levels.
 FORK = 2.0
@@ -272,6 +275,8 @@ class PopulationConfig:
         prune_screen_radius: Gaussians with a larger radius, in pixels, are pruned after
             `schedule.size_prune_after`.
         prune_world_scale: Gaussians with a larger axis, relative to extent, are pruned after the same time.
+            "relocation" limits all axes to this share of the extent instead, or of the distance from the
+            middle of the cameras where that is larger. 0: no limit.
         max_gaussians: largest population. The initial Gaussians are thinned to it (whole octree levels are
             kept, from the coarsest on, and a random part of the next); later the candidates with the largest
             gradients are densified first. 0: no limit.

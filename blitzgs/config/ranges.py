@@ -56,7 +56,11 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
 def problems(config: Config) -> Iterator[str]:
     """Name each field whose value makes no sense, with the value and what is allowed."""
     for name, value in flat(dataclasses.asdict(config)).items():
-        if name in RANGES and not all(number in RANGES[name] for number in _numbers(value)):
+        if (
+            name in RANGES
+            and value is not None
+            and not all(number in RANGES[name] for number in _numbers(value))
+        ):
             yield f"{name}: must be {RANGES[name]}, got {value}"
     schedule, population = config.schedule, config.population
     yield from _problems_of_length(schedule)

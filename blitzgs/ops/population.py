@@ -88,6 +88,20 @@ def position_noise_(
         )
 
 
+def limit_scales_(scales: Tensor, means: Tensor, visible_ids: Tensor, *, share: float, extent: float) -> None:
+    """Limit the axes of the listed Gaussians, in place: `scales = min(scales, log(share max(extent, |mean|)))`.
+
+    Args:
+        scales: [N, 3], logarithms, float32 (CPU also float64).
+        means: [N, 3], relative to the middle of the cameras.
+        visible_ids: int32 [U], the rows to limit, each once.
+        share: positive, of the distance.
+        extent: positive, the least distance, in the unit of the means.
+    """
+    with below_autograd():
+        torch.ops.blitzgs.limit_scales_(scales, means, visible_ids, share, extent)
+
+
 # Largest number of copies of one Gaussian in one event, itself included; 3DGS-MCMC's code has the same limit.
 MAX_COPIES = 51
 

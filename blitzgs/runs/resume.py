@@ -80,7 +80,7 @@ def check_before_capture(folder: Path, wanted: Config, extends: bool) -> None:
 def decided_as(saved: Config, wanted: Config) -> Config:
     """Return `wanted` with the saved values of what it leaves to the capture.
 
-    These are the near plane, and what follows from the number of views: length and opacity term.
+    These are the near plane, the background, and what follows from the number of views: length and opacity term.
     """
     schedule, loss, model = wanted.schedule, wanted.loss, wanted.model
     if schedule.images_per_view > 0:
@@ -89,6 +89,8 @@ def decided_as(saved: Config, wanted: Config) -> Config:
         loss = replace(loss, opacity=saved.loss.opacity, opacity_total=0.0)
     if model.near == 0:
         model = replace(model, near=saved.model.near)
+    if model.background is None:
+        model = replace(model, background=saved.model.background)
     return replace(wanted, schedule=schedule, loss=loss, model=model)
 
 

@@ -13,13 +13,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache, lru_cache, partial
 from pathlib import Path
 
+import numpy as np
+
 import blitzgs
 from blitzgs.capture import image_files
 from blitzgs.capture.capture import Capture, MissingImagesError, capture_fingerprint, load_capture
 from blitzgs.capture.images import ImageStore, decoded_shapes
 from blitzgs.capture.masks import FindDamage, damaged
 from blitzgs.capture.shared_images import SharedImages, size_of
-from blitzgs.config.fields import Config, DataConfig
+from blitzgs.config.fields import BLACK, Config, DataConfig
 from blitzgs.config.files import ConfigError, flat, to_dict
 from blitzgs.distributed.group import Ranks
 from blitzgs.view.views import Space
@@ -28,8 +30,8 @@ from blitzgs.view.views import Space
 HOST_FIELDS = ("data.path", "data.cache_bytes")
 # The least width and height of reduced photographs: a window of SSIM has 11 pixels.
 LEAST_SIDE = 11
-# Photographs whose alpha is looked at before training.
-_LOOKED_AT = 8
+# Photographs whose alpha and mean colour are looked at before training, and the distance of pixels for the mean.
+_LOOKED_AT, _STRIDE = 8, 4
 # The largest memory of a container in bytes, or "max" (Linux, control groups 2).
 _CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
@@ -73,7 +75,7 @@ def open_capture(
     factors = [factor for factor, _ in config.schedule.resolution]
     shared, taken = _share_decoded(decoded_shapes(capture, factors), budget // 2, ranks)
     left = max(0, budget - taken)  # this rank's budget may be below that of the rank which made the memory
-    background = config.model.background
+    background = config.model.background or BLACK
     local = ranks.local_world_size
     threads = min(max(len(os.sched_getaffinity(0)) // local - 2, 2), 32)  # this rank's cores, less two
     return capture, ImageStore(capture, left // local, threads, background=background, shared=shared)
@@ -161,15 +163,33 @@ def check_capture(space: Space, capture: Capture, folder: Path) -> None:
         raise ValueError(f"{capture.root} is not the capture of the run in {folder}: its cameras differ")
 
 
+def _some(capture: Capture) -> list[int]:
+    return capture.train[:: -(-len(capture.train) // _LOOKED_AT)]
+
+
 @lru_cache(maxsize=1)
 def is_opaque(capture: Capture) -> bool:
     """Tell whether training photographs, of which some are decoded, show something in every pixel."""
-    some = capture.train[:: -(-len(capture.train) // _LOOKED_AT)] if capture.has_alpha else []
-    for index in some:
+    for index in _some(capture) if capture.has_alpha else []:
         with contextlib.suppress(OSError, ValueError):  # a damaged one is left to the reader that needs it
             if not image_files.is_opaque(capture.cameras[index].image_path):
                 return False
     return True
+
+
+def mean_colour(capture: Capture, images: ImageStore) -> tuple[float, float, float]:
+    """Return the mean colour of training photographs, of which some are read, RGB in [0, 1].
+
+    Black if none of them can be read: the reader that needs them says so.
+    """
+    some = _some(capture)
+    images.prefetch(some)
+    means = []
+    for index in some:
+        with contextlib.suppress(OSError, ValueError):
+            means.append(images.get(index).numpy()[::_STRIDE, ::_STRIDE].mean(axis=(0, 1)) / 255)
+    red, green, blue = (round(float(value), 4) for value in np.mean(means, axis=0)) if means else BLACK
+    return red, green, blue
 
 
 def check_resolution(config: Config, capture: Capture) -> None:

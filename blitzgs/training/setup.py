@@ -13,7 +13,7 @@ import torch
 
 from blitzgs.capture.capture import Capture, train_views_fingerprint
 from blitzgs.capture.images import ImageStore
-from blitzgs.config.fields import FORK, Config
+from blitzgs.config.fields import BLACK, FORK, Config
 from blitzgs.config.files import save_config
 from blitzgs.config.schedule import Schedule, stretched
 from blitzgs.distributed.group import Ranks
@@ -39,7 +39,7 @@ from blitzgs.table.table import GaussianTable
 from blitzgs.training.agreement import SaveClock
 from blitzgs.training.budget import extended
 from blitzgs.training.exposure import Exposures, exposures_differ, track_gains
-from blitzgs.training.inputs import check_alike, check_capture, check_resolution
+from blitzgs.training.inputs import check_alike, check_capture, check_resolution, is_opaque, mean_colour
 from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
 from blitzgs.training.sampler import BatchSampler, tour_of
@@ -91,7 +91,8 @@ def set_up(
     # index of a training view would then belong to other views.
     train_views = train_views_fingerprint(capture)
     same_views = restored is None or restored.progress.train_views in ("", train_views)
-    config = _continued(_resolved(config, capture, restored, same_views), restored, extend)
+    config = _resolved(config, capture, images, ranks, restored, same_views)
+    config = _continued(config, restored, extend)
     schedule = Schedule(config.schedule)
     if restored is None:
         table, progress = first_gaussians(config, capture, space, ranks, home)
@@ -158,10 +159,18 @@ def set_up(
     )
 
 
-def _resolved(config: Config, capture: Capture, restored: TrainedModel | None, same_views: bool) -> Config:
+def _resolved(
+    config: Config,
+    capture: Capture,
+    images: ImageStore,
+    ranks: Ranks,
+    restored: TrainedModel | None,
+    same_views: bool,
+) -> Config:
     """Return `config` with the values that depend on the training views and on what the run has measured.
 
-    The depths of what the views see decide on the near plane (`model.near`). The number of views decides the
+    The depths of what the views see decide on the near plane (`model.near`), and the colours of the
+    photographs on the background. The number of views decides the
     length of the run (`schedule.images_per_view`) and the opacity term (`loss.opacity_total`). A run that is
     resumed with fewer or more photographs (`data.allow_missing`) keeps the values that it began with.
     `with_pace_of` says what a run measures.
@@ -173,8 +182,21 @@ def _resolved(config: Config, capture: Capture, restored: TrainedModel | None, s
     if model.near == 0:
         # Relative to the extent of this capture: a photograph that is lost later does not move the plane.
         model = replace(model, near=capture.near / capture.extent if saved is None else saved.model.near)
+    if model.background is None:
+        behind = _background(config, capture, images, ranks) if saved is None else saved.model.background
+        model = replace(model, background=behind)
     schedule, loss = stretched(config.schedule, views), weighted(config.loss, views)
     return with_pace_of(replace(config, model=model, schedule=schedule, loss=loss), saved)
+
+
+def _background(
+    config: Config, capture: Capture, images: ImageStore, ranks: Ranks
+) -> tuple[float, float, float]:
+    """Return the background of a run that leaves it to the capture, the same on all ranks."""
+    behind = BLACK
+    if config.model.random_background and ranks.rank == 0 and is_opaque(capture):
+        behind = mean_colour(capture, images)
+    return ranks.broadcast_object(behind)
 
 
 def _continued(config: Config, restored: TrainedModel | None, extend: float | None) -> Config:
@@ -231,7 +253,9 @@ def _stepper(
     noise, factor = None, config.optimiser.position_noise
     if factor > 0:
         noise = PositionNoise(factor, extent, config.population.min_opacity, config.seed)
-    shared = (optimiser, owners, config.loss, extent, noise)
+    relocates = config.population.strategy == "relocation"
+    limit = config.population.prune_world_scale if relocates else 0.0
+    shared = (optimiser, owners, config.loss, extent, noise, limit)
     if not isinstance(table, HostTable):
         return Stepper(table, *shared)
     budget = int(config.memory.resident_gb * 1e9)

@@ -13,6 +13,7 @@ from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import open_transport
 from blitzgs.frame.transport.protocol import stage_ended
 from blitzgs.ops.blocks import ActiveRows, gate_views_
+from blitzgs.ops.population import limit_scales_
 from blitzgs.ops.projection_types import Sizes
 from blitzgs.table.blocks import BlockIndex
 from blitzgs.training.loss import LossTerms, loss_terms
@@ -46,11 +47,16 @@ class Stepper:
         loss: LossConfig,
         extent: float,
         noise: PositionNoise | None = None,
+        limit: float = 0.0,
     ) -> None:
-        """Prepare to step; `extent` is the scene's in the unit of the means."""
+        """Prepare to step; `extent` is the scene's in the unit of the means.
+
+        `limit`: share of the extent, or of the distance from the origin where that is larger, to which the
+        axes of Gaussians are limited; 0: they are not.
+        """
         self.table = self.gaussians = table
         self._optimiser, self._owners = optimiser, owners
-        self._loss, self._extent, self._noise = loss, extent, noise
+        self._loss, self._extent, self._noise, self._limit = loss, extent, noise, limit
         self._transport = open_transport(owners.ranks)
         self.reindex()
 
@@ -128,12 +134,16 @@ class Stepper:
 
         With `keep_means2d`, returns the gradient of the splats' means2d, [P, 2] per pixel.
         """
-        table = self.table
+        table, visible_ids = self.table, frame.projected.visible_ids
         gradients = backward_splats(frame, terms.v_renders)
         self._optimiser.step(table, frame, gradients, terms.scale_reg, terms.opacity_reg, step)
+        if self._limit > 0:
+            limit_scales_(
+                table["scales"], table["means"], visible_ids, share=self._limit, extent=self._extent
+            )
         if self._noise is not None:
-            self._noise.add(table, frame.projected.visible_ids, step, self._optimiser.position_rate(step))
+            self._noise.add(table, visible_ids, step, self._optimiser.position_rate(step))
         stage_ended("optimiser")
-        self._blocks.update(table, frame.projected.visible_ids)
+        self._blocks.update(table, visible_ids)
         stage_ended("other")
         return gradients.means2d if keep_means2d else None

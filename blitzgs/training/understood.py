@@ -12,7 +12,7 @@ import numpy as np
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.images import ImageStore
 from blitzgs.capture.lengths import NEAR_OF_EXTENT, depths_seen, sampled
-from blitzgs.config.fields import Config
+from blitzgs.config.fields import BLACK, Config
 from blitzgs.config.schedule import Schedule, stretched
 from blitzgs.population.density import growth_limit
 from blitzgs.training.inputs import is_opaque, sharing_hint
@@ -197,7 +197,7 @@ def _masks(capture: Capture, pictures: Pictures) -> str:
 def _alpha(capture: Capture, config: Config) -> str:
     if not capture.has_alpha:
         return "none"
-    colour = ", ".join(f"{value:g}" for value in config.model.background)
+    colour = ", ".join(f"{value:g}" for value in config.model.background or BLACK)
     about = capture.about
     extra = f"; a further band of {about.extra_bands} is not used" if about.extra_bands else ""
     if config.model.random_background and not is_opaque(capture):

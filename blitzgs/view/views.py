@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.capture.cameras import camera_centres
-from blitzgs.config.fields import Config
+from blitzgs.config.fields import BLACK, Config
 from blitzgs.frame.render import RenderOptions
 from blitzgs.ops.projection_types import Views
 from blitzgs.view.gate import LodGate, centres_of
@@ -161,7 +161,7 @@ def render_options(config: Config, space: Space, sh_degree: int, lod: LodGate | 
         near_plane=(model.near or _NEAR) * space.extent,
         far_plane=FAR * space.extent,
         antialiased=model.antialiased,
-        background=model.background,
+        background=model.background or BLACK,
         deterministic=model.deterministic,
         fade=() if lod is None else lod.fade(),
     )

@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "adam/position_noise.h"
+#include "adam/scale_limit.h"
 #include "common/op.h"
 
 namespace blitzgs {
@@ -105,6 +106,20 @@ void position_noise_(const Tensor& means, const Tensor& quats, const Tensor& sca
   });
 }
 
+void limit_scales_(const Tensor& scales, const Tensor& means, const Tensor& visible_ids_in, double share,
+                   double extent) {
+  check_floating("scales", scales);
+  const std::int64_t n = scales.size(0);
+  const auto visible_ids = checked<std::int32_t>("visible_ids", visible_ids_in, {-1});
+  BLITZGS_CHECK(share > 0 && extent > 0, "share and extent must be positive, got ", share, " and ", extent);
+  dispatch_floating(scales, [&]<class T>() {
+    const auto limited = checked_in_place<T>("scales", scales, {n, 3});
+    const auto at = checked<T>("means", means, {n, 3});
+    run_rows(scales, ScaleLimit<T>{limited, at, visible_ids, visible_ids.size(0), static_cast<T>(share),
+                                   static_cast<T>(extent)});
+  });
+}
+
 }  // namespace
 }  // namespace blitzgs
 
@@ -113,4 +128,5 @@ BLITZGS_REGISTER(m) {
   BLITZGS_OP(m, "lazy_adam_final_rules", lazy_adam_final_rules);
   BLITZGS_OP(m, "lazy_adam_catch_up_", lazy_adam_catch_up);
   BLITZGS_OP(m, "position_noise_", position_noise_);
+  BLITZGS_OP(m, "limit_scales_", limit_scales_);
 }

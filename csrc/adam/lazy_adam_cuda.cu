@@ -5,6 +5,7 @@
 
 #include "adam/lazy_adam_device.cuh"
 #include "adam/position_noise.h"
+#include "adam/scale_limit.h"
 #include "common/cuda.cuh"
 #include "common/rows.h"
 
@@ -274,5 +275,6 @@ void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream)
 template void lazy_adam<float>(const AdamArgs<float>&, Workspace&, CudaStream);
 template void for_each_row(const FinalRules<float>&, CudaStream);
 template void for_each_row(const PositionNoise<float>&, CudaStream);
+template void for_each_row(const ScaleLimit<float>&, CudaStream);
 
 }  // namespace blitzgs::cuda

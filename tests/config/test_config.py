@@ -13,10 +13,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from blitzgs.cli import main
-from blitzgs.config.fields import Config
+from blitzgs.config.fields import BLACK, Config
 from blitzgs.config.files import (
     REMOVED,
     ConfigError,
+    changed,
     config_hash,
     from_dict,
     load_config,
@@ -135,7 +136,7 @@ def test_an_error_of_a_file_names_the_file(tmp_path, content, message):
 
 NUMBERS = [
     (name, value)
-    for name, value in flat(dataclasses.asdict(Config())).items()
+    for name, value in flat(dataclasses.asdict(changed(Config(), "model", background=BLACK))).items()
     if isinstance(value, (int, float, tuple)) and not isinstance(value, bool)
 ]
 

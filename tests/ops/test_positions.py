@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 import blitzgs
 from blitzgs.ops.counter_random import hash_keys, normal, uniform
 from blitzgs.ops.knn_distances import knn_distances
-from blitzgs.ops.population import position_noise_, voxel_keys
+from blitzgs.ops.population import limit_scales_, position_noise_, voxel_keys
 from blitzgs.population.density import rotations
 from tests.helpers import refused
 
@@ -164,6 +164,28 @@ def test_wrong_shapes_of_position_noise_are_named():
         position_noise_(
             *rows.values(), torch.arange(3, dtype=torch.int32), seed=0, step=0, threshold=0.1, strength=1.0
         )
+
+
+def test_scales_are_limited_by_the_distance_from_the_middle(device):
+    rows, share, extent = gaussians(), 0.05, 1.5
+    visible = torch.arange(0, 300, 2, dtype=torch.int32)
+    scales = rows["scales"].clone().to(device)
+    limit_scales_(scales, rows["means"].to(device), visible.to(device), share=share, extent=extent)
+    limits = (share * rows["means"].double().norm(dim=1).clamp(min=extent)).log()[:, None]
+    wanted = torch.minimum(rows["scales"].double(), limits)
+    wanted[1::2] = rows["scales"][1::2].double()
+    assert 50 < int((wanted < rows["scales"].double() - 1e-4).any(dim=1).sum()) < 140
+    torch.testing.assert_close(scales.cpu().double(), wanted, rtol=0, atol=1e-6)
+    assert torch.equal(scales.cpu()[1::2], rows["scales"][1::2])
+
+
+def test_limits_of_scales_must_be_positive():
+    rows = gaussians(10)
+    visible = torch.arange(3, dtype=torch.int32)
+    with pytest.raises(
+        RuntimeError, match=r"^blitzgs::limit_scales_: share and extent must be positive, got 0"
+    ):
+        limit_scales_(rows["scales"], rows["means"], visible, share=0.0, extent=1.0)
 
 
 def splitmix(state: int) -> int:
