@@ -40,9 +40,9 @@ def _by_names(name: str, fake: Callable[[Arguments], Any]) -> Callable[..., Any]
 
 # Ops that return nothing.
 _IN_PLACE = (
-    "copy_to_host_", "density_stats_", "gate_views_", "lazy_adam_catch_up_", "lazy_adam_step_", "limit_scales_",
-    "mass_cut_", "position_noise_", "project_bwd_step_", "put_rows_", "share_rows_", "swap_blocks_", "take_rows_",
-    "update_block_bounds_", "view_sums_",
+    "copy_to_host_", "density_stats_", "gate_views_", "lazy_adam_catch_up_", "lazy_adam_step_",
+    "limit_scales_", "mass_cut_", "position_noise_", "project_bwd_step_", "put_rows_", "share_rows_",
+    "swap_blocks_", "take_rows_", "update_block_bounds_", "view_sums_",
 )  # fmt: skip
 
 

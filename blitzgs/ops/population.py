@@ -89,7 +89,9 @@ def position_noise_(
 
 
 def limit_scales_(scales: Tensor, means: Tensor, visible_ids: Tensor, *, share: float, extent: float) -> None:
-    """Limit the axes of the listed Gaussians, in place: `scales = min(scales, log(share max(extent, |mean|)))`.
+    """Limit the axes of the listed Gaussians, in place, by their distance from the middle of the cameras.
+
+    ``scales = min(scales, log(share * max(extent, |mean|)))``
 
     Args:
         scales: [N, 3], logarithms, float32 (CPU also float64).

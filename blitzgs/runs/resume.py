@@ -80,7 +80,8 @@ def check_before_capture(folder: Path, wanted: Config, extends: bool) -> None:
 def decided_as(saved: Config, wanted: Config) -> Config:
     """Return `wanted` with the saved values of what it leaves to the capture.
 
-    These are the near plane, the background, and what follows from the number of views: length and opacity term.
+    These are the near plane, the background, and what follows from the number of views: length and opacity
+    term.
     """
     schedule, loss, model = wanted.schedule, wanted.loss, wanted.model
     if schedule.images_per_view > 0:

@@ -30,7 +30,7 @@ from blitzgs.view.views import Space
 HOST_FIELDS = ("data.path", "data.cache_bytes")
 # The least width and height of reduced photographs: a window of SSIM has 11 pixels.
 LEAST_SIDE = 11
-# Photographs whose alpha and mean colour are looked at before training, and the distance of pixels for the mean.
+# Photographs whose alpha and mean colour are looked at before training, and pixels from one to the next.
 _LOOKED_AT, _STRIDE = 8, 4
 # The largest memory of a container in bytes, or "max" (Linux, control groups 2).
 _CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")
