@@ -7,8 +7,8 @@
 Every result is a JSON file that a benchmark wrote with --json; `COMMANDS` names the file and the command. A
 page has a pair of comments around each table, `<!-- table: NAME -->` and `<!-- end: NAME -->`; the text
 between them is replaced. The files must come from one commit, because figures of different code do not
-compare; the record of the GPU tests may come from another. In place of a table whose file is absent the page
-names the command that makes it.
+compare; those of `APART` may come from others. In place of a table whose file is absent the page names the
+command that makes it.
 """
 
 from __future__ import annotations
@@ -50,6 +50,8 @@ COMMANDS = {
         "--batch-sizes 16 --scale 13.85 --seconds-per-run 540"
     ),
 }
+# Results that compare with no other: the record of the tests, and what the recipes reach.
+APART = ("gpu_record", "quality")
 # After commands that take no --json: gpu_record.py writes its file itself, bm_quality.py collects all of its
 # runs in one file.
 COPIED = {
@@ -93,10 +95,9 @@ def load_results(folder: Path = RESULTS) -> Results:
             )
         if " and " in commit:
             raise ReportError(f"{path} is of commit {commit}: measure all of its runs on one")
-        # The record of the tests is made more often.
-        first = next((name for name in results if name != "gpu_record"), path.stem)
+        first = next((name for name in results if name not in APART), path.stem)
         expected = results[first]["commit"]
-        if commit != expected and path.stem != "gpu_record":
+        if commit != expected and path.stem not in APART:
             raise ReportError(
                 f"{path} is of commit {commit}, {first}.json of {expected}: measure both on one"
             )

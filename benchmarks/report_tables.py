@@ -23,7 +23,7 @@ class Section:
 
 
 QUALITY_COLUMNS = (
-    "recipe", "images", "PSNR", "SSIM", "corrected", "training PSNR / SSIM", "seconds",
+    "recipe", "images", "seeds", "PSNR", "SSIM", "corrected", "training PSNR / SSIM", "seconds",
 )  # fmt: skip
 OFFLOAD_COLUMNS = {
     "arm": "arm", "order": "views in order", "pool_gb": "GB on the GPU", "step_ms": "ms a step",

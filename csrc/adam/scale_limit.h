@@ -8,8 +8,8 @@
 // behind it. Splats are ordered by the depths of their centres, so such a Gaussian hides the scene from
 // places where no photograph was taken.
 //
-// means [N, 3], with the middle of the cameras at the origin; scales [N, 3] (log); visible_ids int32 [U] (each
-// row once). The scales are updated in place, one thread per row: deterministic. The cost is O(U).
+// means [N, 3], with the middle of the cameras at the origin; scales [N, 3] (log); visible_ids int32 [U]
+// (each row once). The scales are updated in place, one thread per row: deterministic. The cost is O(U).
 #pragma once
 #include <cmath>
 #include <cstdint>
