@@ -95,8 +95,8 @@ class ModelConfig:
     Attributes:
         sh_degree: highest spherical-harmonics degree, 0..3.
         background: colour behind everything, RGB in [0, 1], also behind transparent photographs. null: black,
-            or with `random_background` the mean colour of the photographs; the run's own configuration has
-            the result.
+            or with `random_background` the mean colour of photographs without alpha; the run's own
+            configuration has the result.
         random_background: each training view has a random colour behind everything instead, so that
             Gaussians have to cover all that photographs show; otherwise places of the background's colour
             stay transparent. No effect if photographs are transparent.

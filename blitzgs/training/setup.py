@@ -39,7 +39,7 @@ from blitzgs.table.table import GaussianTable
 from blitzgs.training.agreement import SaveClock
 from blitzgs.training.budget import extended
 from blitzgs.training.exposure import Exposures, exposures_differ, track_gains
-from blitzgs.training.inputs import check_alike, check_capture, check_resolution, is_opaque, mean_colour
+from blitzgs.training.inputs import check_alike, check_capture, check_resolution, mean_colour
 from blitzgs.training.loss import weighted
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
 from blitzgs.training.sampler import BatchSampler, tour_of
@@ -192,11 +192,13 @@ def _resolved(
 def _background(
     config: Config, capture: Capture, images: ImageStore, ranks: Ranks
 ) -> tuple[float, float, float]:
-    """Return the background of a run that leaves it to the capture, the same on all ranks."""
-    behind = BLACK
-    if config.model.random_background and ranks.rank == 0 and is_opaque(capture):
-        behind = mean_colour(capture, images)
-    return ranks.broadcast_object(behind)
+    """Return the background of a run that leaves it to the capture, the same on all ranks.
+
+    It is black where photographs have alpha: `images` composites them over black.
+    """
+    if not config.model.random_background or capture.has_alpha:
+        return BLACK
+    return ranks.broadcast_object(mean_colour(capture, images) if ranks.rank == 0 else BLACK)
 
 
 def _continued(config: Config, restored: TrainedModel | None, extend: float | None) -> Config:

@@ -196,8 +196,11 @@ def test_a_run_decides_on_its_background_once(tmp_path):
     camera = dataclasses.replace(capture.cameras[0], world_to_camera=np.diag([1.0, -1.0, -1.0, 1.0]))
     camera.world_to_camera[2, 3] = -100.0  # looks away from the scene
     torch.testing.assert_close(model.render(camera), torch.full((HEIGHT, WIDTH, 3), 0.2))
-    train(tmp_path / "black", "schedule.iterations=20", scene=scene)
-    assert open_run(tmp_path / "black").config().model.background == (0.0, 0.0, 0.0)
+    capture.has_alpha = True
+    for name, given in {"alpha": options, "black": options[1:]}.items():
+        train(tmp_path / name, *given, scene=scene)
+        assert open_run(tmp_path / name).config().model.background == (0.0, 0.0, 0.0)
+        capture.has_alpha = False
 
 
 @pytest.mark.parametrize("share", [0.0, 0.03])
