@@ -275,8 +275,8 @@ class PopulationConfig:
         prune_screen_radius: Gaussians with a larger radius, in pixels, are pruned after
             `schedule.size_prune_after`.
         prune_world_scale: Gaussians with a larger axis, relative to extent, are pruned after the same time.
-            "relocation" limits all axes to this share of the extent instead, or of the distance from the
-            middle of the cameras where that is larger. 0: no limit.
+            With `model.random_background` they are not: at each step, axes are limited to this share of the
+            extent, or of the distance from the middle of the cameras where that is larger. 0: no limit.
         max_gaussians: largest population. The initial Gaussians are thinned to it (whole octree levels are
             kept, from the coarsest on, and a random part of the next); later the candidates with the largest
             gradients are densified first. 0: no limit.

@@ -255,8 +255,7 @@ def _stepper(
     noise, factor = None, config.optimiser.position_noise
     if factor > 0:
         noise = PositionNoise(factor, extent, config.population.min_opacity, config.seed)
-    relocates = config.population.strategy == "relocation"
-    limit = config.population.prune_world_scale if relocates else 0.0
+    limit = config.population.prune_world_scale if config.model.random_background else 0.0
     shared = (optimiser, owners, config.loss, extent, noise, limit)
     if not isinstance(table, HostTable):
         return Stepper(table, *shared)

@@ -141,14 +141,14 @@ def training_pixels(state: TrainingState) -> int:
 def density_rules(state: TrainingState, time: int, limit: GrowthLimit | None) -> DensityRules:
     """Return the rules of a density event at `time`, with lengths in the unit of the means."""
     population, extent = state.config.population, state.space.extent
-    by_size, relocates = state.schedule.prunes_by_size(time), population.strategy == "relocation"
+    by_size = state.schedule.prunes_by_size(time)
+    is_limited = state.config.model.random_background  # steps keep to the limit
     return DensityRules(
         grad_threshold=population.grad_threshold,
         clone_scale=population.clone_scale * extent,
         min_opacity=population.min_opacity,
         max_screen_radius=(population.prune_screen_radius or None) if by_size else None,
-        # A relocating step keeps to this limit.
-        max_scale=(population.prune_world_scale * extent or None) if by_size and not relocates else None,
+        max_scale=(population.prune_world_scale * extent or None) if by_size and not is_limited else None,
         max_gaussians=None if limit is None else limit.count,
         min_observations=population.min_observations,
     )
