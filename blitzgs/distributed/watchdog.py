@@ -6,7 +6,8 @@ waited in a collective for long reads what the others published, and prints whic
 After the timeout it exits, or earlier if a rank no longer publishes; torchrun then ends the job. A rank that
 raises publishes its error first, so that the others print its message instead of a message about a closed
 socket; ranks that wait for it end at once. A rank that works on its host for long, for example on a slow
-disk, announces this, and the others wait for it as long as it keeps publishing.
+disk, announces this, and the others wait for it as long as it keeps publishing. All this begins before the
+ranks join: a rank that fails earlier, or never starts, is named too.
 """
 
 from __future__ import annotations
@@ -25,9 +26,11 @@ from datetime import timedelta
 import torch
 from torch.distributed import PrefixStore, TCPStore  # type: ignore[attr-defined]
 
-from blitzgs.util.errors import printable
+from blitzgs.util.errors import UserError, printable
 
 EXIT_STUCK = 75  # EX_TEMPFAIL: a restart may help
+# How long a rank waits at least for the others to start, which includes importing torch from a slow disk.
+START_SECONDS = 120.0
 # How long a rank continues to wait after another rank has reported a failure.
 GRACE_SECONDS = 4.0
 # How long a rank waits until it names those that have not arrived.
@@ -45,18 +48,44 @@ def open_store(name: str, host: bool, timeout_seconds: float) -> PrefixStore:
     new rank must not read the addresses of the rank that it replaces.
 
     `name`: name of this use of the store. `host`: whether this process serves the store if torchrun's agent
-    does not. `timeout_seconds`: for connecting and waiting.
+    does not. `timeout_seconds`: for connecting and waiting. UserError: the store cannot be had.
     """
     held_by_agent = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
-    store = TCPStore(
-        os.environ["MASTER_ADDR"],
-        int(os.environ["MASTER_PORT"]),
-        is_master=host and not held_by_agent,
-        wait_for_workers=False,
-        multi_tenant=True,
-        timeout=timedelta(seconds=timeout_seconds),
-    )
+    address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+    try:
+        store = TCPStore(
+            address,
+            port,
+            is_master=host and not held_by_agent,
+            wait_for_workers=False,
+            multi_tenant=True,
+            timeout=timedelta(seconds=timeout_seconds),
+        )
+    except RuntimeError as error:
+        raise UserError(
+            f"no way to {address}:{port} (MASTER_ADDR, MASTER_PORT) within {timeout_seconds:.0f} s: has the "
+            f"host of rank 0 started and not ended, and can it be reached? ({str(error).splitlines()[0]})"
+        ) from error
     return PrefixStore(f"blitzgs/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}/{name}", store)
+
+
+def report_early_failure(message: str) -> None:
+    """Publish why this process of a job ends, if it has not joined it yet; see `Watchdog.report_failure`."""
+    rank = int(os.environ["RANK"])
+    store = open_store("watchdog", host=rank == 0, timeout_seconds=5)
+    store.compare_set("failure", "", f"rank {rank} failed: {message}")
+    time.sleep(1.0)  # the store may end with this process: let the others read it
+
+
+def early_failure() -> str | None:
+    """Return why a process of this job has failed, for one that has not joined it yet; None: none is known.
+
+    UserError: torchrun's store has ended.
+    """
+    if os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True":
+        return None  # rank 0 serves the store, and only when it joins
+    store = open_store("watchdog", host=False, timeout_seconds=5)
+    return str(store.get("failure").decode()) if store.check(["failure"]) else None
 
 
 @dataclass(frozen=True)
@@ -101,8 +130,9 @@ class Watchdog:
         self.world_size = world_size
         self.timeout_seconds = timeout_seconds
         self.period = self.period_for(timeout_seconds)
+        self.start_seconds = max(START_SECONDS, timeout_seconds)
         # A separate connection, because the process group's may block inside a collective.
-        self.store = open_store("watchdog", host=False, timeout_seconds=30)
+        self.store = open_store("watchdog", rank == 0, self.start_seconds)
         self.lock = threading.Lock()
         self.calls = 0
         self.name = "start"
@@ -124,6 +154,29 @@ class Watchdog:
     def period_for(timeout_seconds: float) -> float:
         """Return the seconds between two checks of the clock."""
         return min(2.0, timeout_seconds / 5)
+
+    def await_start(self) -> None:
+        """Wait until all ranks have made their watchdog (UserError: one has failed, or has not come)."""
+        keys = {rank: f"progress/{rank}" for rank in range(self.world_size)}
+        begin, told = time.monotonic(), False
+        while True:
+            with self.lock:
+                if self.store.check(list(keys.values())):
+                    return
+                missing = [str(rank) for rank, key in keys.items() if not self.store.check([key])]
+            if failure := self._first_failure():
+                raise UserError(f"rank {self.rank} has not begun, because {failure}")
+            waited = time.monotonic() - begin
+            text = f"has waited {waited:.0f} s for ranks that have not started: {', '.join(missing)}"
+            if waited > self.start_seconds:
+                raise UserError(
+                    f"rank {self.rank} {text}. Look for their errors in the output of their hosts; if they "
+                    "are only slow, raise ranks.timeout_seconds"
+                )
+            if waited > PATIENCE_SECONDS and not told:
+                told = True
+                print(f"rank {self.rank}: {text}", file=sys.stderr, flush=True)
+            time.sleep(0.2)
 
     @contextmanager
     def waiting(self, name: str) -> Iterator[None]:

@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch.distributed import HashStore
 
+from blitzgs.cli import main
 from blitzgs.distributed import watchdog
 from blitzgs.distributed.group import (
     ALLOCATOR_VARIABLES,
@@ -151,6 +152,28 @@ def test_a_bad_rank_ends_the_job_with_its_message(how, expected):
         assert "waited 3 s in all_reduce: rank 1 has not arrived" in failure.value.blame
     assert expected in failure.value.messages[0]
     assert expected in failure.value.messages[2]
+
+
+def _start(rank, arguments):
+    watchdog.START_SECONDS = 3.0
+    if rank == 1:
+        return main(arguments) if arguments else None
+    return Ranks.from_environment("cpu", timeout_seconds=1.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["doctor", "--devise=cpu"], "rank 1 failed: wrong usage"),
+        (["eval", "/dev/null", "--device=cuda:99"], "rank 1 failed: ValueError: .* cuda:99"),
+        ([], r"has waited 3 s for ranks that have not started: 1\. Look"),
+    ],
+)
+def test_a_rank_that_ends_before_it_joins_is_named(arguments, expected):
+    start = time.monotonic()
+    with pytest.raises(RankError, match=expected) as failure:
+        run_ranks(_start, 2, arguments, join=False, limit=60)
+    assert "UserError" in failure.value.messages[0] and time.monotonic() - start < 45
 
 
 def _work(ranks, hang):
