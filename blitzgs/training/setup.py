@@ -208,7 +208,7 @@ def _continued(config: Config, restored: TrainedModel | None, extend: float | No
     if extend is not None:
         # An interrupted extension may have left its schedule in the folder's configuration.
         config = replace(config, schedule=restored.config.schedule)
-    check_resumable(restored.config, config)
+    check_resumable(restored.config, config, restored.progress.step)
     return config if extend is None else extended(config, restored.progress.step, extend)
 
 
