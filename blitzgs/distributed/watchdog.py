@@ -184,9 +184,9 @@ class Watchdog:
 
         Enter it for collectives, and to wait for this rank's device, which may itself be waiting for other
         ranks. A rank that has entered fewer of these contexts than another is called late, so all ranks must
-        enter the same ones. RuntimeError: the work in the context failed; the message names the rank that
-        caused it. If this rank is out of memory, its own `torch.OutOfMemoryError` is raised instead, and its
-        message is for the other ranks.
+        enter the same ones. UserError: the work in the context failed because of the rank that the message
+        names; RuntimeError: that rank is not known. If this rank is out of memory, its own
+        `torch.OutOfMemoryError` is raised instead, and its message is for the other ranks.
         """
         self.calls += 1
         self.name = name
@@ -197,7 +197,10 @@ class Watchdog:
             raise
         except RuntimeError as error:
             self.waiting_since = None
-            raise RuntimeError(f"{self.diagnose(name)} ({error})") from error
+            if blame := self.diagnose():
+                raise UserError(f"rank {self.rank}: {name} failed{blame}") from error
+            text = f"rank {self.rank}: {name} failed; another rank ended or lost its connection ({error})"
+            raise RuntimeError(text) from error
         finally:
             self.waiting_since = None
 
@@ -226,24 +229,21 @@ class Watchdog:
         self.stopping.set()
         self.thread.join(timeout=5)
 
-    def diagnose(self, name: str) -> str:
-        """Return a message that names the rank that broke the collective `name`, if the store has it."""
+    def diagnose(self) -> str:
+        """Return which rank broke a collective, as the end of a sentence; empty: the store does not say."""
         # The failed rank's message may not have arrived yet, and a live rank publishes within one period.
         for _ in range(10 + int(5 * self.period)):
             with suppress(RuntimeError):
                 self._listen()
-            failure = self._first_failure()
-            if failure:
-                return f"rank {self.rank}: {name} failed because {failure}"
+            if failure := self._first_failure():
+                return f" because {failure}"
             if self.stopping.wait(0.2):
                 break
         try:
             late = self._late_ranks()
         except RuntimeError:
-            return f"rank {self.rank}: {name} failed and the job's store is gone (its host process ended)"
-        if late:
-            return f"rank {self.rank}: {name} failed; {late}"
-        return f"rank {self.rank}: {name} failed; another rank ended or lost its connection"
+            return " and the job's store is gone (its host process ended)"
+        return f"; {late}" if late else ""
 
     def _first_failure(self) -> str | None:
         try:

@@ -152,6 +152,8 @@ def test_a_bad_rank_ends_the_job_with_its_message(how, expected):
         assert "waited 3 s in all_reduce: rank 1 has not arrived" in failure.value.blame
     assert expected in failure.value.messages[0]
     assert expected in failure.value.messages[2]
+    if how in ("raise", "memory", "kill"):  # of which commands print no traceback
+        assert "UserError: rank 0: all_reduce failed" in failure.value.messages[0]
 
 
 def _start(rank, arguments):
