@@ -339,8 +339,8 @@ class Watchdog:
 
     def _abort(self, reason: str) -> None:
         blame = self._first_failure() or self._late_ranks() or "no rank is known to be late"
-        message = f"rank {self.rank}: {reason}: {blame}. Ending the job."
-        print(printable(message), file=sys.stderr, flush=True)
+        message = f"{reason}: {blame}"
+        print(printable(f"rank {self.rank}: {message}. Ending the job."), file=sys.stderr, flush=True)
         self.report_failure(message)
         # The main thread is inside a collective that cannot be interrupted.
         os._exit(EXIT_STUCK)
