@@ -26,6 +26,7 @@ from blitzgs.sfm.photographs import Photographs, estimate, judge_positions
 from blitzgs.sfm.pycolmap_stage import features
 from blitzgs.sfm.reconstruct import Settings
 from blitzgs.sfm.report import Reconstruction, _reason, examine
+from blitzgs.util.errors import UserError
 from tests.capture.helpers import Posed, opensfm, pix4d, realitycapture, warned, write_image
 from tests.sfm.scene import FOCAL, aligned, with_gps, write_photographs
 from tests.training.tiny import OVERRIDES, as_flags
@@ -348,6 +349,14 @@ def test_other_ranks_wait_for_rank_0(tmp_path, monkeypatch):
     (tmp_path / "capture/sfm/report.json").write_text("{}")
     thread.join(10)
     assert [config.data.path for config in results] == [str(tmp_path / "capture")]
+
+
+def test_other_ranks_end_if_rank_0_fails(tmp_path, monkeypatch):
+    write_photographs(tmp_path / "photos", 3)
+    monkeypatch.setenv("RANK", "1")
+    monkeypatch.setattr("blitzgs.distributed.watchdog.early_failure", lambda: "rank 0 failed: no pairs")
+    with pytest.raises(UserError, match="there are no poses, because rank 0 failed: no pairs"):
+        command.with_poses(config_of(tmp_path / "photos"), tmp_path / "capture")
 
 
 @pytest.mark.slow
