@@ -40,8 +40,11 @@ def quat_scale_to_covar_preci(
         Two of [..., 3, 3], or None for what is not wanted.
 
     Raises:
+        TypeError: an argument is not a tensor.
         ValueError: a shape does not fit.
     """
+    check_tensor("quats", quats)
+    check_tensor("scales", scales)
     if quats.shape[-1:] != (4,) or scales.shape != (*quats.shape[:-1], 3):
         raise ValueError(
             f"quats must be [..., 4] and scales [..., 3], got {list(quats.shape)} and {list(scales.shape)}"
@@ -77,8 +80,10 @@ def relocate(
 
     Raises:
         ValueError: a shape does not fit.
-        TypeError: `min_opacity` is a table.
+        TypeError: an argument is not a tensor, or `min_opacity` is a table.
     """
+    for name, value in (("opacities", opacities), ("scales", scales), ("ratios", ratios)):
+        check_tensor(name, value)
     if opacities.dim() != 1 or scales.shape != (len(opacities), 3) or ratios.shape != opacities.shape:
         raise ValueError(
             f"opacities and ratios must be [N] and scales [N, 3], got {list(opacities.shape)}, "
