@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor
 
-from blitzgs.util.errors import check_tensor
+from blitzgs.util.errors import check_tensors
 
 MAX_SH_DEGREE = 4
 
@@ -32,10 +32,9 @@ def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor
         TypeError: an argument is not a tensor, or the masks are not bool.
         ValueError: the degree is not 0 to 4, or a shape does not fit.
     """
-    check_tensor("dirs", dirs)
-    check_tensor("coeffs", coeffs)
+    check_tensors(dirs=dirs, coeffs=coeffs)
     if masks is not None:
-        check_tensor("masks", masks)
+        check_tensors(masks=masks)
         if masks.dtype != torch.bool:
             raise TypeError(f"masks must be bool, got {masks.dtype}; pass masks != 0")
     if not 0 <= degree <= MAX_SH_DEGREE:
