@@ -67,7 +67,8 @@ class DefaultStrategy(Strategy):
         refine_scale2d_stop_iter: step from which radii do not count; 0: they never do.
         refine_start_iter: refinement begins after this step.
         refine_stop_iter: and ends at this one.
-        reset_every: steps between two resets of the opacities to at most twice `prune_opa`.
+        reset_every: steps between two resets of the opacities to at most twice `prune_opa`, as in gsplat's
+            main branch; a slip in the condition of 1.5.3 leaves them out.
         refine_every: steps between two refinements.
         pause_refine_after_reset: steps without refinement after each reset.
         absgrad: whether `info["means2d"].absgrad` counts (`rasterization(..., absgrad=True)`).

@@ -14,7 +14,7 @@ import psutil
 import torch
 from torch import Tensor
 
-from blitzgs.util.errors import amount, check_tensor
+from blitzgs.util.errors import amount, check_tensors
 
 # Writers take so many Gaussians at a time: 62 MB at SH degree 3.
 BLOCK = 1 << 18
@@ -114,8 +114,8 @@ class Gaussians:
         shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, k, 3)}
         shapes |= {"normals": (n, 3), "levels": (n,)}
         given = self._columns()
+        check_tensors(**given)
         for name, tensor in given.items():
-            check_tensor(name, tensor)
             rows = _bad_rows(name, tensor)
             if bool(rows.any()):
                 first = int(rows.nonzero()[0])

@@ -14,6 +14,7 @@ from blitzgs._library import below_autograd
 from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.intersect import TileGrid, pixels_of_tiles
 from blitzgs.ops.splat_gradients import GradientBuffer, RasterizeSaved, gradient_columns
+from blitzgs.util.errors import check_tensors
 
 # For alphas = 1 - transmittances. With the number 1, torch would first make a tensor of it, which takes 5 us
 # of the host's time. A tensor without dimensions on the CPU combines with tensors of any device and dtype.
@@ -90,10 +91,16 @@ def rasterize(
         Renders [B, H, W, D] and alphas [B, H, W].
 
     Raises:
+        TypeError: an argument is not a tensor.
         RuntimeError: wrong shapes or dtypes, or a tile range outside the images; on the CPU also lists of
             other splats.
         ValueError: `store_absgrad` under `torch.compile`.
     """
+    if composited is None:
+        check_tensors(
+            means2d=means2d, conics=conics, splat_opacities=splat_opacities, colors=colors,
+            isect_splats=isect_splats, tile_offsets=tile_offsets,
+        )  # fmt: skip
     splats = (means2d, conics, splat_opacities, colors, backgrounds, isect_splats, tile_offsets)
     grid = TileGrid(n_cameras, width, height, tile_size, tile_begin, tile_end)
     if torch.compiler.is_compiling():
