@@ -272,6 +272,14 @@ def test_what_cannot_work_is_said(tmp_path, monkeypatch, capsys):
         patch.setattr("importlib.util.find_spec", lambda name: None)
         patch.setenv("PATH", "")
         assert "pip install 'blitzgs[sfm]'" in message("photos", "capture")
+    with monkeypatch.context() as patch:
+
+        def refuse(link, *args, **kwargs):
+            raise PermissionError(1, "Operation not permitted", link)
+
+        patch.setattr(Path, "symlink_to", refuse)
+        assert "photos (Operation not permitted): choose a capture on a disk" in message("photos", "exfat")
+        assert not (tmp_path / "exfat/sfm/database.db").exists()
     (tmp_path / "photos/view_1.jpg").write_bytes(b"hello")
     assert "3 photographs are needed, 2 can be used" in message("photos", "capture")
 
@@ -302,6 +310,24 @@ def test_photographs_in_other_formats_are_named(tmp_path):
     Photographs.of(tmp_path)
     (tmp_path / "view_9.heic").write_bytes(b"")
     warned(r"only its 3 photographs are used; \.heic cannot be read: convert", Photographs.of, tmp_path)
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".avif", ".jp2", ".gif"])
+def test_photographs_that_colmap_does_not_read_are_left_out(tmp_path, suffix):
+    write_photographs(tmp_path, 3)
+    shown = cv2.imread(str(tmp_path / "view_0.jpg"))
+    write_image(tmp_path / f"view_7{suffix.upper()}", shown)
+    assert pycolmap.Bitmap.read(tmp_path / f"view_7{suffix.upper()}", False) is None
+    found = Photographs.of(tmp_path)
+    assert len(found.names) == 3
+    assert found.damage == {
+        f"view_7{suffix.upper()}": f"COLMAP reads no {suffix.upper()} files: convert it to JPEG or PNG"
+    }
+    (tmp_path / "view_1.jpg").unlink()
+    with pytest.raises(
+        ValueError, match=f"3 photographs are needed, 2 can be used; COLMAP reads no {suffix.upper()}"
+    ):
+        Photographs.of(tmp_path)
 
 
 def test_photographs_alone_are_recognised(tmp_path, capsys):
