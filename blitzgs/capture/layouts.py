@@ -75,6 +75,7 @@ def read_layout(
     elif folder is not None:
         read = [_read_colmap(root, model, images, downscale) for model in models]
         views, points = read[0] if len(read) == 1 else _joined(read)
+        notes += [note for model in models for note in _of_other_kind(root, model)]
         shown = " and ".join(str(model.relative_to(root)) for model in models if model != root)
         about = About(shown or "cameras, images and points3D", "", tuple(notes))
     elif "train" in parts:
@@ -146,6 +147,14 @@ def _models(root: Path, sparse: str) -> tuple[list[Path], list[str]]:
     return [models[0][0]], [note]
 
 
+def _of_other_kind(root: Path, model: Path) -> list[str]:
+    """Return a line if a model has files of both kinds, of which one is read: the others may be newer."""
+    read = (colmap.complete_files(model) or {})["images"]
+    other = read.with_suffix(".txt" if read.suffix == ".bin" else ".bin")
+    shown = relative_to(root, read)
+    return [f"{shown} is read, and {other.name} beside it not"] if other.is_file() else []
+
+
 def _joined(parts: list[tuple[list[SourceView], SourcePoints]]) -> tuple[list[SourceView], SourcePoints]:
     """Return the views and points of several models; of an image in two of them, the first counts."""
     views = {view.name: view for found, _ in reversed(parts) for view in found}
@@ -203,8 +212,9 @@ def _read_colmap(
     root: Path, folder: Path, images: str, downscale: float, part: str = ""
 ) -> tuple[list[SourceView], SourcePoints]:
     model = colmap.read_model(folder)
+    used = set(model.images.camera_ids.tolist())
     with located(str(folder)):
-        lenses = lenses_of(model.cameras)
+        lenses = lenses_of([camera for camera in model.cameras if camera.id in used])
     names = model.images.names
     if len(set(names)) < len(names):
         twice = next(name for name, count in Counter(names).items() if count > 1)

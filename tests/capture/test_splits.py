@@ -220,6 +220,18 @@ def test_the_largest_of_several_models_is_read(tmp_path, counts, text):
         load_capture(tmp_path, sparse="sparse/77")
 
 
+def test_the_files_of_a_model_that_are_not_read_are_named(tmp_path):
+    models(tmp_path, (4,))
+    assert load_capture(tmp_path).about.notes == ()
+    reconstruction(["00.png"], 64, 48).write_text(str(tmp_path / "sparse/0"))
+    capture = load_capture(tmp_path)
+    assert len(capture.cameras) == 4
+    assert capture.about.notes == ("sparse/0/images.bin is read, and images.txt beside it not",)
+    (tmp_path / "sparse/0/cameras.bin").unlink()
+    notes = load_capture(tmp_path, sparse="sparse/0").about.notes
+    assert notes == ("sparse/0/images.txt is read, and images.bin beside it not",)
+
+
 def test_a_damaged_model_is_not_the_largest(tmp_path):
     models(tmp_path, (4, 9))
     (tmp_path / "sparse" / "1" / "images.bin").write_bytes(b"\xff" * 40)
