@@ -25,6 +25,8 @@ from blitzgs.util.errors import located, warn
 
 # What programs write beside the images of a synthetic capture.
 _BY_PRODUCT = re.compile(rf"(?i)({BY_PRODUCTS})s?(_?\d+)?$")
+# How far entries of an image's rotation in two models of one world may be apart.
+_SAME_TURN = 0.05
 
 
 @dataclass(frozen=True)
@@ -156,8 +158,19 @@ def _of_other_kind(root: Path, model: Path) -> list[str]:
 
 
 def _joined(parts: list[tuple[list[SourceView], SourcePoints]]) -> tuple[list[SourceView], SourcePoints]:
-    """Return the views and points of several models; of an image in two of them, the first counts."""
-    views = {view.name: view for found, _ in reversed(parts) for view in found}
+    """Return the views and points of several models; of an image in two of them, the first counts.
+
+    ValueError: such an image looks elsewhere in the second, so that their worlds are not the same.
+    """
+    views: dict[str, SourceView] = {}
+    for view in (view for found, _ in parts for view in found):
+        known = views.setdefault(view.name, view)
+        ours, theirs = (each.world_to_camera[:3, :3] for each in (known, view))
+        if not np.allclose(ours, theirs, atol=_SAME_TURN, equal_nan=True):
+            raise ValueError(
+                f"data.sparse: {view.name} is in two COLMAP models and looks elsewhere in the second: their "
+                "worlds are not the same; name one model, or align them first (colmap model_merger)"
+            )
     columns = [points.columns() for _, points in parts]
     common = [name for name in columns[0] if all(name in others for others in columns)]
     joined: dict[str, Any] = {name: np.concatenate([each[name] for each in columns]) for name in common}

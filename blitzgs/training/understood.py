@@ -149,7 +149,7 @@ def _warn_of_pictures(capture: Capture, pictures: Pictures, near: float) -> None
         warn(
             f"{len(unlike)} of {len(known)} photographs that were looked at show other colours than the "
             f"points where these should be (first: {unlike[0]}): are they the photographs of these poses, "
-            "not turned, cropped or renamed since?"
+            "not turned, cropped or renamed since, and the points those of the scene?"
         )
     views = capture.train[:_PROJECTED]
     points = sampled(capture.points, len(capture.cameras))
