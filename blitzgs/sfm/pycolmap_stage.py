@@ -65,6 +65,11 @@ def features(job: dict[str, Any]) -> None:
         for image in database.read_all_images():
             _, latitude, longitude = seen.get(image.name, ("", None, None))
             prior = known.get(image.image_id)
+            if (latitude, longitude) == (0, 0):  # a receiver without a fix
+                if prior is not None:
+                    prior.position = np.full(3, np.nan)
+                    database.update_pose_prior(prior)
+                continue
             if latitude is None or longitude is None or (prior is not None and prior.has_position()):
                 continue
             added = prior or pycolmap.PosePrior(corr_data_id=image.data_id)

@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from blitzgs.capture.capture import load_capture
 from blitzgs.capture.world import frame_beside, geodetic
@@ -175,6 +176,23 @@ def test_interrupted_work_goes_on_and_is_placed_by_gps(tmp_path, monkeypatch):
     )
     assert height == pytest.approx(metres[1][2] + 400, abs=0.01)
     assert not (tmp_path / "images").is_symlink()
+
+
+@pytest.mark.parametrize("altitude", [True, False])
+def test_a_receiver_without_a_fix_says_no_place(tmp_path, altitude):
+    placed = write_photographs(tmp_path / "images", 3)
+    with_gps(tmp_path / "images", placed, altitude)
+    path = tmp_path / "images/view_0.jpg"
+    with Image.open(path) as photo:
+        exif = photo.getexif()
+        exif.get_ifd(0x8825).update({2: (0.0, 0.0, 0.0), 4: (0.0, 0.0, 0.0)})
+        photo.save(path, exif=exif)
+    job = {"photos": str(tmp_path / "images"), "names": [f"view_{i}.jpg" for i in range(3)], "masks": ""}
+    database = tmp_path / "database.db"
+    features({**job, "database": str(database), "camera_model": "auto"})
+    assert sorted(engine.read_positions(database)) == ["view_1.jpg", "view_2.jpg"]
+    features({**job, "database": str(database), "camera_model": "auto"})  # as later photographs are added
+    assert sorted(engine.read_positions(database)) == ["view_1.jpg", "view_2.jpg"]
 
 
 def test_a_camera_of_exif_is_another_camera(tmp_path):
