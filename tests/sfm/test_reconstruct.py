@@ -24,7 +24,7 @@ from blitzgs.cli import sfm as command
 from blitzgs.config.files import load_config
 from blitzgs.sfm import engine, reconstruct
 from blitzgs.sfm.photographs import Photographs, estimate, judge_positions
-from blitzgs.sfm.pycolmap_stage import features
+from blitzgs.sfm.pycolmap_stage import features, pairs
 from blitzgs.sfm.reconstruct import Settings
 from blitzgs.sfm.report import Reconstruction, _reason, examine
 from tests.capture.helpers import Posed, opensfm, pix4d, realitycapture, warned, write_image
@@ -193,6 +193,16 @@ def test_a_receiver_without_a_fix_says_no_place(tmp_path, altitude):
     assert sorted(engine.read_positions(database)) == ["view_1.jpg", "view_2.jpg"]
     features({**job, "database": str(database), "camera_model": "auto"})  # as later photographs are added
     assert sorted(engine.read_positions(database)) == ["view_1.jpg", "view_2.jpg"]
+    assert engine.lack_places(str(database), job["names"])
+    assert not engine.lack_places(str(database), job["names"][1:])
+    origin = tmp_path / "georeference.json"
+    by_gps = {"pairs": "gps", "gps": True, "use_altitude": altitude, "georeference": str(origin)}
+    pairs({**job, **by_gps, "database": str(database)})
+    # It has no neighbours by GPS, but by name, and is not the origin of the world.
+    assert engine.read_found(database)["view_0.jpg"].neighbours == 2
+    assert json.loads(origin.read_text())["latitude"] == pytest.approx(47.0, abs=0.01)
+    with pycolmap.Database.open(database) as opened:
+        assert len({prior.coordinate_system for prior in opened.read_all_pose_priors()}) == 1
 
 
 def test_a_camera_of_exif_is_another_camera(tmp_path):
