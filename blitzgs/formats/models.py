@@ -51,7 +51,7 @@ class Format:
         if source.degree > 0 and not self.harmonics:
             lost.append(f"{self.title} holds one colour a Gaussian: colours that depend on the view are lost")
         if self.cut is not None and (count := sum(int(self.cut(block).sum()) for block in source.blocks())):
-            lost.append(f"{self.title} holds {self.cut_to}: {count:,} Gaussians became smaller or darker")
+            lost.append(f"{self.title} holds {self.cut_to}: {count:,} Gaussians have others in the file")
         return lost
 
 
@@ -67,7 +67,7 @@ FORMATS = {
     "splat": Format(".splat", ".splat", packed.read_splat, packed.write_splat, harmonics=False),
     "spz": Format(
         "SPZ", ".spz", packed.read_spz, packed.write_spz, (b"\x1f\x8b", b"NGSP"), ("antialiasing",),
-        cut=packed.cut_by_spz, cut_to="scales to 379 units and colours to 1.44 of white",
+        cut=packed.cut_by_spz, cut_to="scales of 0.000045 to 379 units and colours to 1.44 of white",
     ),
     "sog": Format("SOG", ".sog", read_sog, write_sog, (b"PK",), ("antialiasing",)),
     "glb": Format("GLB", ".glb", None, write_glb, (b"glTF",), ("levels",), quantised=False),

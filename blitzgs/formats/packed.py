@@ -303,8 +303,9 @@ def write_spz(path: Path, source: GaussianSource) -> None:
 
 
 def cut_by_spz(model: Gaussians) -> torch.Tensor:
-    """Tell which Gaussians are larger or brighter than the bytes of SPZ can say, bool [N]."""
-    return (model.scales > 255.5 / 16 - 10).any(dim=1) | (model.sh[:, 0] > 0.5 / 0.15).any(dim=1)
+    """Tell which Gaussians are larger, smaller or brighter than the bytes of SPZ can say, bool [N]."""
+    longest = model.scales.amax(dim=1)
+    return (longest > 255.5 / 16 - 10) | (longest < -0.5 / 16 - 10) | (model.sh[:, 0] > 0.5 / 0.15).any(dim=1)
 
 
 def read_spz(path: Path) -> Gaussians:
