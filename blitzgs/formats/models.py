@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from blitzgs.formats import packed
-from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased
+from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased, triple_line, triple_of
 from blitzgs.formats.glb import write_glb
 from blitzgs.formats.ply import PlySource, read_ply, save_ply
 from blitzgs.formats.sog import read_sog, write_sog
@@ -124,7 +124,7 @@ def read_gaussians(path: Path | str) -> Gaussians:
     with located(str(path)):
         found.check()
     if "offset" not in kind.states and (offset := stated_offset(offset_file(path))):
-        found.comments = [*found.comments, offset_line(offset)]
+        found.comments = [*found.comments, triple_line("offset", offset)]
     return found
 
 
@@ -151,16 +151,6 @@ def stated_offset(path: Path) -> tuple[float, float, float] | None:
     return (x, y, z) if {"file", "meaning"} <= content.keys() else None
 
 
-def offset_line(offset: tuple[float, float, float]) -> str:
-    """Return the header line that `offset_of` reads."""
-    return "comment offset {!r} {!r} {!r}".format(*offset)
-
-
 def offset_of(comments: list[str]) -> tuple[float, float, float]:
     """Return the offset that `blitzgs export` writes into a header; zero: there is none."""
-    for line in comments:
-        words = line.split()
-        if words[:2] == ["comment", "offset"] and len(words) == 5:
-            x, y, z = (float(word) for word in words[2:])
-            return x, y, z
-    return 0.0, 0.0, 0.0
+    return triple_of(comments, "offset") or (0.0, 0.0, 0.0)

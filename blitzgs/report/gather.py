@@ -24,7 +24,8 @@ from blitzgs.runs.checkpoint_files import DAMAGE
 from blitzgs.runs.evaluation import FOLDER, INDEX, METRICS, PARTS, preview_file
 from blitzgs.runs.folder import RunFolder, open_run
 from blitzgs.runs.world import load_world_frame
-from blitzgs.viewer.world import horizontal, up_direction
+from blitzgs.view.views import up_direction
+from blitzgs.viewer.world import horizontal
 
 T = TypeVar("T")
 Point = tuple[float, float | None, float]

@@ -15,12 +15,11 @@ import numpy.typing as npt
 import torch
 
 from blitzgs.config.files import changed
-from blitzgs.formats.gaussians import Gaussians, GaussianSource
+from blitzgs.formats.gaussians import Gaussians, GaussianSource, triple_line
 from blitzgs.formats.models import (
     Format,
     check_replaces,
     offset_file,
-    offset_line,
     offset_of,
     stated_offset,
 )
@@ -135,7 +134,7 @@ def _write(
             raise FileExistsError(
                 f"{sidecar} exists and is not the offset of an exported model: choose another name"
             )
-        lines.append(offset_line(offset))
+        lines.append(triple_line("offset", offset))
     step = torch.from_numpy(shift)
 
     def moved(block: Gaussians) -> Gaussians:
