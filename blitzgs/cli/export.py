@@ -205,6 +205,8 @@ def _export_tiles(args: argparse.Namespace, selection: Selection | None) -> None
     )
     if beside is not None:
         print(f"coordinates are relative to ({x!r}, {y!r}, {z!r}), as {beside} says")
+    for line in FORMATS["spz"].told(written.lost):
+        print(line, file=sys.stderr)
     if args.tiles and not args.spz_tiles:
         print(f"look at it: blitzgs view {shlex.quote(str(path))}")
 
@@ -252,8 +254,9 @@ def _export_file(args: argparse.Namespace) -> None:
             written = export_file(source, kind, path)
     else:
         source, written = _export_run(args, kind, path, selection)
-    print(f"{path}: {len(source):,} Gaussians, {path.stat().st_size / 1e6:.1f} MB")
-    for line in kind.unstated(source):
+    count = len(source) - written.lost.left_out
+    print(f"{path}: {count:,} Gaussians, {path.stat().st_size / 1e6:.1f} MB")
+    for line in kind.unstated(source) + kind.told(written.lost):
         print(line, file=sys.stderr)
     _explain(written, source, kind, args)
 

@@ -25,7 +25,7 @@ import numpy.typing as npt
 import torch
 
 from blitzgs.formats.gaussians import SH_C0, Gaussians, GaussianSource, unit_quats, up_of
-from blitzgs.formats.packed import write_spz
+from blitzgs.formats.packed import Lost, SpzGrid, write_spz
 from blitzgs.formats.partition import around
 from blitzgs.util.output import check_replaceable, new_file
 from blitzgs.util.rotations import quaternions
@@ -94,14 +94,15 @@ def write_glb(path: Path, source: GaussianSource, up: tuple[float, float, float]
         file.write(_head(_json(source, columns, size, box, up).ljust(room), size))
 
 
-def write_spz_glb(path: Path, model: Gaussians) -> None:
+def write_spz_glb(path: Path, model: Gaussians, grid: SpzGrid) -> Lost:
     """Write Gaussians whose up is +Z as a GLB with an SPZ file inside, as CesiumJS 1.144 reads it.
 
     It reads no rotation of the node, only a matrix, and stops at accessors of opacities and of SH degree 0,
-    which SPZ's decoder gives as COLOR_0. ImportError: gsply is missing. ValueError, OSError: as `write_glb`.
+    which SPZ's decoder gives as COLOR_0. `grid` has room for all positions. ImportError: gsply is missing.
+    ValueError, OSError: as `write_glb`.
     """
     model.check()
-    write_spz(packed := path.with_suffix(".spz"), model)
+    lost = write_spz(packed := path.with_suffix(".spz"), model, grid)
     data = packed.read_bytes()
     packed.unlink()
     means = model.means.double().numpy() * [1.0, -1.0, -1.0]
@@ -112,6 +113,7 @@ def write_spz_glb(path: Path, model: Gaussians) -> None:
     text, data = text.ljust(-(-len(text) // 4) * 4), data.ljust(-(-len(data) // 4) * 4, b"\0")
     with new_file(path) as partial:
         partial.write_bytes(_head(text, len(data)) + data)
+    return lost
 
 
 def _head(text: bytes, size: int) -> bytes:
