@@ -105,10 +105,7 @@ def test_the_tileset_has_the_fields_of_3d_tiles_1_1(written):
 def test_tiles_with_spz_inside_say_so_and_are_turned_back(tmp_path):
     gaussforge = pytest.importorskip("gaussforge")
     model = city(800, levels=False)
-    model.sh.clamp_(-1, 1)
-    model.means[3, 0], model.scales[4] = 3e7, 7.0
     done = write_tiles(tmp_path / "t", model, np.eye(4), SCENE, "the city", most=300, spz=True)
-    assert done.gaussians == 799 and done.lost == (1, 1)
     assert sorted(os.listdir(tmp_path / "t")) == ["tiles", "tileset.json"]  # the page reads no SPZ
     assert not list(tmp_path.rglob("*.spz")) and done.bytes < 40 * 1.2 * len(model)
     tileset = json.loads((tmp_path / "t" / "tileset.json").read_text())
@@ -133,9 +130,26 @@ def test_tiles_with_spz_inside_say_so_and_are_turned_back(tmp_path):
         turn = np.array(content["nodes"][0]["matrix"]).reshape(4, 4).T[:3, :3]
         if "children" not in node:
             found.append(positions @ turn.T)
-    x, y, z = model.means[torch.arange(800) != 3].numpy().T
+    x, y, z = model.means.numpy().T
     wanted = np.stack([x, z, -y], axis=1)  # +Z is +Y in glTF
     np.testing.assert_allclose(np.sort(np.concatenate(found), axis=0), np.sort(wanted, axis=0), atol=1e-3)
+
+
+def test_tiles_with_spz_count_what_it_cannot_hold(tmp_path):
+    pytest.importorskip("gsply")
+    model = city(800, levels=False)
+    model.sh.clamp_(-1, 1)
+    model.means[3, 0], model.scales[4] = 3e7, 7.0
+    done = write_tiles(tmp_path / "t", model, np.eye(4), SCENE, "the city", most=300, spz=True)
+    assert done.gaussians == 799 and done.lost == (1, 1)
+    tileset = json.loads((tmp_path / "t" / "tileset.json").read_text())
+    held = 0
+    for node, _ in nodes(tileset["root"]):
+        content, _ = glb_parts(tmp_path / "t" / node["content"]["uri"])
+        count = content["accessors"][0]["count"]
+        assert count == node["content"]["extras"]["gaussians"]
+        held += 0 if "children" in node else count
+    assert held == 799 and np.abs(corners(tileset["root"]["content"]["boundingVolume"])).max() < 1e6
 
 
 def test_errors_fall_and_volumes_hold_what_is_inside(written):
