@@ -259,6 +259,28 @@ def test_a_comparison_has_what_differs(trained, other):
     assert shown == ["photograph", "run, render", "short, render", "run, error", "short, error"]
 
 
+def test_a_comparison_of_other_cameras_says_so(trained, tmp_path):
+    run = tmp_path / "changed"
+    shutil.copytree(trained[1], run)
+    stored = json.loads((run / "cameras.json").read_text())
+
+    def notes(**changes):
+        cameras = [camera | changes.get("each", {}) for camera in stored["cameras"]]
+        lists = {"cameras": cameras, "test": changes.get("test", stored["test"])}
+        (run / "cameras.json").write_text(json.dumps(stored | lists))
+        return " ".join(data_of(compare([trained[1], run]))["left_out"])
+
+    assert notes() == ""
+    for changes, differs in (
+        ({"each": {"width": 9}}, "sizes of images"),
+        ({"each": {"world_to_camera": np.eye(4).tolist()}}, "poses"),
+        ({"test": stored["test"] + stored["train"][:1]}, "held-out views"),
+        ({"each": {"name": "a.jpg"}}, "photographs, held-out views"),
+    ):
+        with pytest.warns(UserWarning, match=f"changed has other {differs} than run, so"):
+            assert f"changed has other {differs} than run" in notes(**changes)
+
+
 @pytest.fixture(scope="module")
 def browser(trained):
     with Browser("about:blank") as browser:
