@@ -399,11 +399,19 @@ def test_hostile_names_are_shown_as_they_are(trained, tmp_path, browser):
         content["views"] = dict(zip(names, content["views"].values(), strict=True))
         return content
 
-    folder = copied(trained, tmp_path / "run", cameras=renamed, metrics=measured)
+    def widths(kind):
+        return browser.evaluate(f"[...document.querySelectorAll('{kind}')].map(e => e.offsetWidth)")
+
+    folder = copied(trained, tmp_path / ("x" * 200), cameras=renamed, metrics=measured)
+    page = tmp_path / "compare.html"
+    assert main(["compare", str(trained[1]), str(folder), "--out", str(page)]) == 0
+    opened(browser, page)
+    assert sum(widths("#figures th")) <= browser.evaluate("innerWidth")
     assert main(["report", str(folder)]) == 0
     opened(browser, folder / "report.html")
+    assert widths(".thumb") and set(widths(".thumb")) == {118}
     assert HOSTILE in column(browser, "views", 0)[0]
     time.sleep(0.3)
-    assert browser.evaluate("document.title") == "run · report"
+    assert browser.evaluate("document.title") == f"{folder.name} · report"
     assert browser.evaluate("document.querySelectorAll('img[src=x]').length") == 0
     assert browser.errors() == []
