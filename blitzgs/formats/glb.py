@@ -183,8 +183,9 @@ def _json(
         "attributes": {column.name: i for i, column in enumerate(columns)},
         "extensions": {EXTENSION: extension},
     }
+    comments = [line.encode("utf-8", "replace").decode() for line in source.comments]  # JSON is UTF-8
     content: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "BlitzGS", "extras": {"comments": source.comments}},
+        "asset": {"version": "2.0", "generator": "BlitzGS", "extras": {"comments": comments}},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gzip
 import math
+import os
 import re
 import shutil
 import struct
@@ -128,7 +129,7 @@ def write_compressed_ply(path: Path, source: GaussianSource) -> None:
     count, rest, first = len(source), _rest(source.degree), 0
     chunks, lines = -(-count // _CHUNK), _layout(count, len(_BOUNDS), source.degree)
     with new_file(path) as partial, open(partial, "r+b") as file:
-        begin = file.write("\n".join([*lines[:2], *source.comments, *lines[2:], "end_header\n"]).encode())
+        begin = file.write(os.fsencode("\n".join([*lines[:2], *source.comments, *lines[2:], "end_header\n"])))
         for block in unit_blocks(source):
             content: bytes = _gsply().compress_to_bytes(_gsdata(block))
             own = (first // _CHUNK, -(-len(block) // _CHUNK), chunks, _CHUNK_BYTES)
@@ -162,7 +163,7 @@ def read_compressed_ply(path: Path) -> Gaussians:
     header, found, _ = start.partition(b"end_header\n")
     if not found:
         raise ValueError(f"{path}: the header of the PLY file does not end")
-    lines = header.decode("ascii", "replace").splitlines()
+    lines = os.fsdecode(header.replace(b"\r", b"")).split("\n")[:-1]
     comments = [line for line in lines if line.startswith(("comment ", "obj_info "))]
     layout = [line.strip() for line in lines if line not in comments]
     elements = {

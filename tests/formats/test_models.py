@@ -23,7 +23,7 @@ from blitzgs.formats import packed
 from blitzgs.formats.gaussians import MIP, SH_C0, Gaussians
 from blitzgs.formats.models import FORMATS, check_replaces, read_gaussians, with_degree
 from blitzgs.runs.world import rotated_harmonics
-from tests.helpers import refused, some_gaussians
+from tests.helpers import glb_parts, refused, some_gaussians
 
 gaussforge = pytest.importorskip("gaussforge")
 gsply = pytest.importorskip("gsply")
@@ -370,6 +370,17 @@ def damaged_splats(path):
 DAMAGED = {
     "compressed-ply": damaged_plys, "splat": damaged_splats, "spz": damaged_spzs, "sog": damaged_sogs
 }  # fmt: skip
+
+
+def test_comments_keep_their_letters(tmp_path, model):
+    lines = ["comment Größe \u2028", os.fsdecode(b"comment Gr\xf6\xdfe"), "obj_info a"]
+    for name in ("ply", "compressed-ply"):
+        path = written(tmp_path, name, replace(model, comments=lines))
+        assert read_gaussians(path).comments == lines
+        path.write_bytes(path.read_bytes().replace(b"a\nelement", b"a\r\nelement"))
+        assert read_gaussians(path).comments == lines
+    content, _ = glb_parts(written(tmp_path, "glb", replace(model, comments=lines)))
+    assert content["asset"]["extras"]["comments"][:2] == [lines[0], "comment Gr??e"]
 
 
 @pytest.mark.parametrize("name", PACKED)
