@@ -7,7 +7,6 @@
 // autograd, and blitzgs/_fakes.py its fake kernel.
 #include <torch/csrc/stable/library.h>
 
-#include <cstdint>
 #include <vector>
 
 #include "common/kernel.h"

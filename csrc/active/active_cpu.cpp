@@ -1,6 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
-#include <cstring>
 #include <utility>
 #include <vector>
 
@@ -11,7 +9,6 @@
 #include "math/morton.h"
 
 namespace blitzgs::cpu {
-
 namespace {
 
 void bound_block(const BlockRows& rows, std::int64_t block, float* bounds) {

@@ -1,13 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
-
 #include "active/pool.h"
 #include "active/view_gate.h"
 #include "common/cuda.cuh"
 #include "exchange/transport.h"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 constexpr int kThreads = 256, kWarps = kThreads / 32;

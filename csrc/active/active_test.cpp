@@ -1,7 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <cmath>
-#include <vector>
-
 #include "active/blocks.h"
 #include "active/view_gate.h"
 #include "common/catch.h"

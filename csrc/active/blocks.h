@@ -25,12 +25,9 @@
 // how large the capacity has to be.
 #pragma once
 #include <cfloat>
-#include <cmath>
-#include <cstdint>
 
 #include "active/view_gate.h"
 #include "adam/lazy_adam.h"
-#include "common/kernel.h"
 #include "math/frustum.h"
 
 namespace blitzgs {

@@ -1,12 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-
 #include "active/blocks.h"
 #include "active/view_gate.h"
 #include "common/cuda.cuh"
 #include "math/morton.h"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 constexpr int kWarps = kBlockRows / 32;

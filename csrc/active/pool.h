@@ -5,11 +5,7 @@
 //
 // A block is 256 consecutive rows (active/blocks.h). A slot is the memory of one block in the pool.
 #pragma once
-#include <cstddef>
-#include <cstdint>
-
 #include "active/blocks.h"
-#include "common/kernel.h"
 
 namespace blitzgs {
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // What views leave out of the active rows: the cull mask and its layouts, the LOD gate, and the op of both.
 #pragma once
-#include <cstdint>
-
 #include "common/kernel.h"
 
 // The cull mask has a bit for each row of a table and each column (a training view), in two layouts:
@@ -57,11 +55,6 @@ struct CullMask {
   std::int32_t *rows, *sectors;
   std::int64_t n, words;
 };
-
-namespace BLITZGS_BACKEND {
-void sectors_of_rows(const CullMask&, CudaStream);
-void rows_of_sectors(const CullMask&, CudaStream);
-}  // namespace BLITZGS_BACKEND
 
 // The view level (BlitzGS, section 3.3; levels as in Octree-GS, Ren et al. 2024): drops pairs of a row and a
 // view from the active set before the projection.
@@ -160,10 +153,6 @@ BLITZGS_HD void gate_entry(const ViewGateArgs& args, const GateTable& table, std
   if (kept != seen) args.views[i] = static_cast<std::int32_t>(kept);
 }
 
-namespace BLITZGS_BACKEND {
-void gate_views(const ViewGateArgs&, CudaStream);
-}  // namespace BLITZGS_BACKEND
-
 // Fills `table` with the table of the rules and the camera centres. All threads of a block call this, each
 // for one level and one view.
 BLITZGS_HD void fill_gate_table(const GateRules& rules, const float* viewmats, int thread, GateTable& table) {
@@ -173,5 +162,11 @@ BLITZGS_HD void fill_gate_table(const GateRules& rules, const float* viewmats, i
     camera_centre(viewmats + 16 * thread, table.centres[thread]);
   }
 }
+
+namespace BLITZGS_BACKEND {
+void sectors_of_rows(const CullMask&, CudaStream);
+void rows_of_sectors(const CullMask&, CudaStream);
+void gate_views(const ViewGateArgs&, CudaStream);
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

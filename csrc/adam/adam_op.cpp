@@ -1,11 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "adam/lazy_adam_op.h"
 
-#include <cmath>
-
 #include "adam/position_noise.h"
 #include "adam/scale_limit.h"
-#include "common/op.h"
 
 namespace blitzgs {
 namespace {

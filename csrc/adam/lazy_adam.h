@@ -31,10 +31,6 @@
 // Rows are independent, and each element is computed in the same way wherever it is, so the results do not
 // depend on the order of the list or on sharding. The cost is O(1) per element.
 #pragma once
-#include <cmath>
-#include <cstdint>
-
-#include "common/kernel.h"
 #include "math/vec.h"
 
 // Columns of the table of a learning-rate schedule, double [S + 1, 30], made once in Python
@@ -61,9 +57,7 @@ constexpr int kAdamColumns = 5;  // means, quats, scales, opacities, sh
 
 template <class T>
 struct AdamColumn {
-  T* param;
-  T* exp_avg;
-  T* exp_avg_sq;
+  T *param, *exp_avg, *exp_avg_sq;
   const T* grad;  // [n, width], one row for each row of the list; null if rows only catch up
   std::int64_t width;
 };

@@ -1,13 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
-#include <type_traits>
-
 #include "adam/lazy_adam.h"
 #include "adam/lazy_adam_row.h"
 #include "common/parallel.h"
 
 namespace blitzgs::cpu {
-
 namespace {
 
 template <class T>

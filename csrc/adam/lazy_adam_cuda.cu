@@ -1,16 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
-#include <stdexcept>
-#include <type_traits>
-
 #include "adam/lazy_adam_device.cuh"
 #include "adam/position_noise.h"
 #include "adam/scale_limit.h"
-#include "common/cuda.cuh"
 #include "common/rows.h"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 // The lazy optimiser (lazy_adam.h) on CUDA. Catching up takes three kernels: prepare computes the rules and

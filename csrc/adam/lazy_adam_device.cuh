@@ -2,8 +2,6 @@
 // The Adam step of a few elements of a row, for step_kernel (lazy_adam_cuda.cu) and for the projection's
 // backward pass that takes the step (project_step_cuda.cu).
 #pragma once
-#include <cstdint>
-
 #include "adam/lazy_adam.h"
 #include "common/cuda.cuh"
 

@@ -3,9 +3,6 @@
 // the same element-wise loops, so they give the same bits. Everything here has internal linkage, so that the
 // linker cannot mix the two.
 #pragma once
-#include <cmath>
-#include <cstdint>
-
 #include "adam/lazy_adam.h"
 
 namespace blitzgs::cpu {

@@ -16,9 +16,6 @@
 // means [N, 3], quats [N, 4], scales [N, 3] (log), opacities [N] (logit), ids int64 [N], visible_ids int32
 // [U] (each row once). strength has the unit of an inverse length.
 #pragma once
-#include <cstdint>
-
-#include "common/kernel.h"
 #include "math/counter_random.h"
 #include "math/gaussian.h"
 

@@ -11,10 +11,6 @@
 // means [N, 3], with the middle of the cameras at the origin; scales [N, 3] (log); visible_ids int32 [U]
 // (each row once). The scales are updated in place, one thread per row: deterministic. The cost is O(U).
 #pragma once
-#include <cmath>
-#include <cstdint>
-
-#include "common/kernel.h"
 #include "math/vec.h"
 
 namespace blitzgs {

@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
 // How this library was built: for `blitzgs doctor`, and for tests, which branches of cuda.cuh it takes.
-#include <cuda_runtime.h>
 
 #include "common/cuda.cuh"
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // What the tests that run without torch share. Catch2 v2 and v3 define their macros in different headers.
 #pragma once
-#include <cstddef>
-#include <cstdint>
 #include <memory>
 #include <vector>
 

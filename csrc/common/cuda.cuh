@@ -6,7 +6,6 @@
 #include <algorithm>
 #include <array>
 #include <atomic>
-#include <cstdint>
 #include <cuda/atomic>
 #include <stdexcept>
 #include <string>

@@ -2,7 +2,6 @@
 // Work on rows that do not know each other: a struct with the number n of rows, whose operator() does the
 // work of row i. For CUDA, a kernel file of the struct's folder instantiates for_each_row.
 #pragma once
-
 #include "common/kernel.h"
 #include "common/parallel.h"
 #ifdef __CUDACC__

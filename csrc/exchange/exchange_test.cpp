@@ -1,6 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <vector>
-
 #include "common/catch.h"
 #include "exchange/scatter.h"
 #include "exchange/tile_costs.h"

@@ -14,8 +14,6 @@
 //
 // The cost is O(words moved). Splats beyond the given size of a group are dropped, whatever the masks say.
 #pragma once
-#include <cstdint>
-
 #include "common/kernel.h"
 
 namespace blitzgs {
@@ -46,10 +44,6 @@ struct alignas(8) SplatPlace {
 
 constexpr int kScatterBlock = 256;
 constexpr int kMaxSplatColumns = 8;
-
-inline std::int64_t scatter_blocks(std::int64_t splats) {
-  return (splats + kScatterBlock - 1) / kScatterBlock;
-}
 
 // bits != 0.
 BLITZGS_HD int lowest_bit(std::uint64_t bits) {

@@ -1,11 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
-
-#include "common/cuda.cuh"
 #include "exchange/scatter_device.cuh"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 // The values of a splat that a thread sums: all 9 of a splat with three colour channels, or up to 16 of more.

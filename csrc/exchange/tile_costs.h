@@ -11,8 +11,6 @@
 // dependence on the order for the same reason: sums of integers are exact below 2^24, and larger means exceed
 // the largest float16, 65504, which is stored for them.
 #pragma once
-#include <cstdint>
-
 #include "common/kernel.h"
 
 namespace blitzgs::cpu {

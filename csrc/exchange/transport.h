@@ -17,7 +17,6 @@
 // receives the values for the host. A rank that waits for longer than timeout_seconds aborts its kernels, so
 // that its process gets an error.
 #pragma once
-#include "common/kernel.h"
 #include "exchange/scatter.h"
 #include "project/project.h"
 

@@ -1,12 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
-
-#include "common/cuda.cuh"
 #include "exchange/scatter_device.cuh"
 #include "exchange/transport.h"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 constexpr int kThreads = 128;
@@ -208,9 +204,7 @@ void send_splats(const SendArguments& args, CudaStream stream) {
   plan_kernel<<<1, 32, 0, stream>>>(args);
   check_launch("send_splats");
   if (args.splats.count == 0) return;
-  const auto blocks =
-      std::min<std::int64_t>(scatter_blocks(args.splats.count), kSendBlocks * multiprocessors());
-  send_kernel<<<static_cast<unsigned>(blocks), kScatterBlock, 0, stream>>>(
+  send_kernel<<<resident_blocks(args.splats.count, kScatterBlock, kSendBlocks), kScatterBlock, 0, stream>>>(
       args.splats, args.targets, args.plan, {args.plan->filled, args.places}, args.n_ranks);
   check_launch("send_splats");
 }

@@ -14,10 +14,6 @@
 // pixels fits. CPU and CUDA agree to the rounding of alpha. The cost is O(entries processed x pixels of the
 // splat).
 #pragma once
-#include <cmath>
-#include <cstdint>
-
-#include "common/kernel.h"
 #include "rasterize/rasterize.h"
 
 namespace blitzgs {
@@ -74,16 +70,12 @@ struct CullRow {
 
 struct ViewSums {
   const std::int64_t* weights;
-  const std::int32_t* pixels;
-  const std::int32_t* radii;
-  const std::int32_t* camera_ids;
+  const std::int32_t *pixels, *radii, *camera_ids;
   const bool* counts;
-  const std::int32_t* visible_ids;
-  const std::int32_t* splat_offsets;
+  const std::int32_t *visible_ids, *splat_offsets;
   std::int64_t n, words;
   std::int64_t* score;
-  std::int32_t* seen;
-  std::int32_t* counted;
+  std::int32_t *seen, *counted;
   std::uint32_t* cull;
   ScoreRule rule;
   double eps, unit;

@@ -1,14 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "importance/importance.h"
 
-#include <type_traits>
-
-#include "common/cuda.cuh"
 #include "common/rows.h"
 #include "rasterize/forward.cuh"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 // A half-warp writes the weights of this many entries at its 16 pixels to shared memory; then each lane sums

@@ -24,7 +24,6 @@
 // The result is exact: no order of additions, division among ranks or repetition changes a bit. The cost is
 // O(P).
 #pragma once
-#include <cstdint>
 #include <limits>
 
 #include "common/kernel.h"
@@ -56,8 +55,7 @@ struct SegmentSearch {
 
 struct MassCutArgs {
   const std::int64_t* weights;
-  const std::int32_t* segments;
-  const std::int32_t* owners;
+  const std::int32_t *segments, *owners;
   const std::int64_t* ids;
   std::int64_t n_items, n_segments;
   std::int64_t numerator, denominator;  // the share

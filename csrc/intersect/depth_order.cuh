@@ -6,9 +6,6 @@
 // between the nearest and the farthest depth), the key lacks the low bits, and splats with equal keys are
 // compared by depth and then by id.
 #pragma once
-#include <cstdint>
-
-#include "common/cuda.cuh"
 #include "intersect/intersect.h"
 #include "intersect/radix_sweep.cuh"
 

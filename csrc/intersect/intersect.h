@@ -23,19 +23,13 @@
 // The cost is O(P) for the radix sort, O(tile rows) for the tests and O(I) to write. Counts are 64-bit; P and
 // B*T must be below 2^31.
 #pragma once
-#include <cstdint>
-
-#include "common/kernel.h"
 #include "math/tiles.h"
 
 namespace blitzgs {
 
 template <class T>
 struct IntersectInput {
-  const T* means2d;
-  const T* conics;
-  const T* opacities;
-  const T* depths;
+  const T *means2d, *conics, *opacities, *depths;
   const std::int32_t* camera_ids;
   const std::int64_t* ids;
   std::int64_t n_splats;

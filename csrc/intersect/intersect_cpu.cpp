@@ -1,7 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
 #include <array>
-#include <atomic>
 #include <vector>
 
 #include "common/parallel.h"
@@ -184,11 +182,9 @@ std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::
   return place;
 }
 
-template std::int64_t count_intersections<float>(const IntersectInput<float>&, Workspace&, CudaStream);
-template std::int64_t count_intersections<double>(const IntersectInput<double>&, Workspace&, CudaStream);
-template std::int64_t intersect<float>(const IntersectInput<float>&, std::int64_t, std::int32_t*,
-                                       std::int64_t*, Workspace&, CudaStream);
-template std::int64_t intersect<double>(const IntersectInput<double>&, std::int64_t, std::int32_t*,
-                                        std::int64_t*, Workspace&, CudaStream);
+template decltype(count_intersections<float>) count_intersections<float>;
+template decltype(count_intersections<double>) count_intersections<double>;
+template decltype(intersect<float>) intersect<float>;
+template decltype(intersect<double>) intersect<double>;
 
 }  // namespace blitzgs::cpu

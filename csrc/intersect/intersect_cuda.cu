@@ -18,13 +18,10 @@
 
 #include <cuda/std/functional>
 
-#include "common/cuda.cuh"
-#include "common/kernel.h"
 #include "intersect/depth_order.cuh"
 #include "intersect/radix_sweep.cuh"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 using Input = IntersectInput<float>;

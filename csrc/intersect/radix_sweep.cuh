@@ -6,12 +6,7 @@
 // has only a few hundred blocks, which all run at once, and would otherwise spend most of its time on the
 // look-back. The number of pairs is read from device memory.
 #pragma once
-#include <algorithm>
-#include <cstdint>
-#include <cuda/atomic>
-
 #include "common/cuda.cuh"
-#include "common/kernel.h"
 
 namespace blitzgs::cuda {
 

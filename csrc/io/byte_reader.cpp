@@ -4,7 +4,6 @@
 #include "io/byte_reader.h"
 
 namespace blitzgs::io {
-
 namespace {
 constexpr std::uint64_t kBufferBytes = 1 << 18;
 

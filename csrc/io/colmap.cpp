@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <iterator>
-#include <limits>
 
 #include "io/byte_reader.h"
 #include "io/colmap.h"

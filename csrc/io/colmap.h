@@ -8,11 +8,7 @@
 // multiple of the file's size. Newer models also have rigs and frames files; they are not needed, because the
 // images file still holds the pose of each image.
 #pragma once
-#include <cstdint>
 #include <iosfwd>
-#include <string>
-#include <string_view>
-#include <vector>
 
 #include "io/byte_reader.h"
 

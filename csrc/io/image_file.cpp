@@ -8,11 +8,8 @@
 #include <algorithm>
 #include <array>
 #include <cerrno>
-#include <cstring>
-#include <string_view>
 
 namespace blitzgs::io {
-
 namespace {
 
 using namespace std::string_view_literals;

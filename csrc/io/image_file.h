@@ -2,13 +2,8 @@
 // Reads image files whole, and refuses those whose damage a decoder would conceal or only print; reads and
 // writes QOI, and reads headers.
 #pragma once
-#include <cstdint>
 #include <optional>
 #include <span>
-#include <stdexcept>
-#include <string>
-#include <string_view>
-#include <vector>
 
 #include "io/byte_reader.h"
 

@@ -2,10 +2,8 @@
 #include "io/image_file.h"
 
 #include <algorithm>
-#include <string_view>
 
 namespace blitzgs::io {
-
 namespace {
 
 using namespace std::string_view_literals;

@@ -1,7 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
-#include <string_view>
-#include <vector>
 
 #include "common/catch.h"
 #include "io/image_file.h"

@@ -11,15 +11,8 @@
 #include <iterator>
 #include <memory>
 #include <new>
-#include <span>
-#include <sstream>
-#include <stdexcept>
-#include <string>
-#include <string_view>
 #include <tuple>
-#include <type_traits>
 #include <utility>
-#include <vector>
 
 #include "io/colmap.h"
 #include "io/image_file.h"

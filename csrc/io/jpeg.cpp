@@ -1,15 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "io/image_file.h"
 
-#include <algorithm>
-#include <array>
 #include <utility>
-#include <vector>
 
 #include "io/jpeg_codes.h"
 
 namespace blitzgs::io {
-
 namespace {
 
 constexpr std::uint8_t kSof0 = 0xc0, kSof2 = 0xc2, kDht = 0xc4, kRst0 = 0xd0, kSoi = 0xd8, kEoi = 0xd9,

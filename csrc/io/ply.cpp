@@ -2,16 +2,12 @@
 #include "io/ply.h"
 
 #include <algorithm>
-#include <charconv>
 #include <iterator>
 #include <optional>
-#include <sstream>
-#include <string>
 
 #include "io/byte_reader.h"
 
 namespace blitzgs::io {
-
 namespace {
 
 std::string read_token(ByteReader& reader) {

@@ -4,12 +4,7 @@
 // Reads ASCII and binary of either byte order. Elements after the vertices are not read; list properties of
 // the vertices are refused. Rows are packed in header order without padding.
 #pragma once
-#include <cstdint>
 #include <iosfwd>
-#include <limits>
-#include <string>
-#include <string_view>
-#include <vector>
 
 #include "io/byte_reader.h"
 

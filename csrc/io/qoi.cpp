@@ -4,7 +4,6 @@
 #include <array>
 
 namespace blitzgs::io {
-
 namespace {
 
 constexpr std::size_t kHeader = 14;

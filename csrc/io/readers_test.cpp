@@ -3,8 +3,6 @@
 #include <cmath>
 #include <functional>
 #include <optional>
-#include <sstream>
-#include <type_traits>
 
 #include "common/catch.h"
 #include "io/byte_reader.h"

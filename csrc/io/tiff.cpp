@@ -5,7 +5,6 @@
 #include "io/image_file.h"
 
 namespace blitzgs::io {
-
 namespace {
 
 constexpr unsigned kNewSubfileType = 254, kWidth = 256, kHeight = 257, kBits = 258, kCompression = 259,

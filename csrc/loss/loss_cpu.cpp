@@ -1,7 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
-#include <type_traits>
-
 #include "common/parallel.h"
 #include "loss/photometric.h"
 #include "loss/photometric_strip.h"

@@ -1,9 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "loss/photometric.h"
 
-#include <cmath>
-#include <tuple>
-
 #include "common/op.h"
 
 namespace blitzgs {

@@ -1,7 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <cmath>
-#include <vector>
-
 #include "common/catch.h"
 #include "loss/photometric.h"
 

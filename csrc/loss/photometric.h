@@ -26,9 +26,6 @@
 // fixed order, and zero if the block has no pixel; the op report (below) adds the parts up. The
 // result repeats bit for bit for any number of threads.
 #pragma once
-#include <cstdint>
-
-#include "common/kernel.h"
 #include "math/vec.h"
 
 namespace blitzgs {
@@ -119,13 +116,6 @@ BLITZGS_HD SsimTerms<T> ssim_terms(T mean_x, T e, T p, T q) {
   return terms;
 }
 
-namespace BLITZGS_BACKEND {
-template <class T>
-std::int64_t photometric_parts(const PhotometricArgs<T>& args);
-template <class T>
-void photometric(const PhotometricArgs<T>& args, Workspace&, CudaStream);
-}  // namespace BLITZGS_BACKEND
-
 // The report of a training step: the sums of the loss, added up from the parts that the photometric kernel
 // wrote, and the costs of this rank's tiles. One launch writes the report to the memory of every rank that
 // reads it. Parts are added in a fixed order. CPU and CUDA agree to the rounding of doubles.
@@ -163,6 +153,10 @@ struct LossOfSums {
 };
 
 namespace BLITZGS_BACKEND {
+template <class T>
+std::int64_t photometric_parts(const PhotometricArgs<T>& args);
+template <class T>
+void photometric(const PhotometricArgs<T>& args, Workspace&, CudaStream);
 template <class T>
 void loss_of_sums(const LossOfSums<T>&, CudaStream);
 template <class T>

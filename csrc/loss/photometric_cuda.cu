@@ -11,7 +11,6 @@
 //   5 The gradient; a thread has one column again.
 // All five steps run in every round, each on the rows that the step before it handled one round earlier, with
 // one barrier per round. The arithmetic of a pixel does not depend on how the image is divided into strips.
-#include <algorithm>
 #include <climits>
 
 #include "common/cuda.cuh"
@@ -19,7 +18,6 @@
 #include "loss/photometric_device.cuh"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 // Shared memory of one round; two rounds alternate.

@@ -1,12 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 // Helpers of the kernel in photometric_cuda.cu: sizes, ownership, the vertical and horizontal windows.
 #pragma once
-#include <type_traits>
-
 #include "loss/photometric.h"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 constexpr int kThreads = 256;

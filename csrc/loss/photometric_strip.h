@@ -9,7 +9,6 @@
 // taps are 3 floats apart in a row.
 #pragma once
 #include <algorithm>
-#include <cmath>
 #include <memory>
 
 #include "loss/photometric.h"

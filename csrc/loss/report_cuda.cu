@@ -3,7 +3,6 @@
 #include "loss/photometric.h"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 constexpr int kReportThreads = 256;

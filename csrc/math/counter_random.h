@@ -3,7 +3,6 @@
 // SplitMix64 (Steele, Lea, Flood 2014) over a tuple of keys.
 #pragma once
 #include <cmath>
-#include <cstdint>
 
 #include "common/kernel.h"
 

@@ -9,8 +9,6 @@
 // max |row_x - u row_z| over the clamped slopes u. Multiplied by z, each condition is a linear inequality
 // n . p + d + k sigma >= 0.
 #pragma once
-#include <cmath>
-
 #include "math/projection.h"
 #include "math/vec.h"
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
-#include <limits>
 #include <random>
-#include <vector>
 
 #include "common/catch.h"
 #include "math/gaussian.h"

@@ -2,7 +2,6 @@
 // Morton (Z-order) codes: points with neighbouring codes lie close together.
 #pragma once
 #include <algorithm>
-#include <cstdint>
 
 #include "common/kernel.h"
 #ifdef __CUDACC__

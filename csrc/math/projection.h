@@ -9,9 +9,6 @@
 // determinant |m0 x m1|^2 + eps tr(M M^T) + eps^2 is then a sum of non-negative terms, while the usual
 // ac - b^2 cancels for elongated splats.
 #pragma once
-#include <cmath>
-#include <limits>
-
 #include "math/gaussian.h"
 
 namespace blitzgs {

@@ -16,10 +16,6 @@
 // Every kernel must count the same tiles, because the count of one kernel is the buffer size of another. The
 // expressions here therefore use mul() and mul_add(), which the compiler cannot contract differently.
 #pragma once
-#include <cmath>
-#include <cstdint>
-
-#include "common/kernel.h"
 #include "math/vec.h"
 
 namespace blitzgs {

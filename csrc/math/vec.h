@@ -2,7 +2,6 @@
 // Three-vectors and the few scalar helpers the maths headers share.
 #pragma once
 #include <cmath>
-#include <cstdint>
 #include <cstring>
 #include <type_traits>
 

@@ -1,11 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Work on columns of a table: copies of rows, checks, and sampling without replacement.
 #pragma once
-#include <cmath>
-#include <cstddef>
-#include <cstdint>
-
-#include "common/kernel.h"
 #include "math/counter_random.h"
 #include "math/vec.h"
 
@@ -22,10 +17,6 @@ struct CopyRows {
   const std::int64_t* to;
   std::int64_t n, row_bytes;
 };
-
-namespace BLITZGS_BACKEND {
-void copy_rows(const CopyRows&, CudaStream);
-}  // namespace BLITZGS_BACKEND
 
 // Looks for values that are not finite in some columns, and for zeros in others, in one pass without memory
 // of their size: `bad` becomes 1 if there is one, and else keeps its value.
@@ -50,12 +41,6 @@ BLITZGS_HD bool is_bad(T value, bool zero_is_bad) {
   // A number that is not finite, times zero, is NaN.
   return zero_is_bad ? value == T(0) : !(value * T(0) == T(0));
 }
-
-namespace BLITZGS_BACKEND {
-void clear_flag(std::int32_t* bad, CudaStream);
-template <class T>
-void check_columns(const CheckedColumns<T>&, CudaStream);
-}  // namespace BLITZGS_BACKEND
 
 // Sampling without replacement in proportion to weights, by exponential races (Efraimidis and Spirakis 2006):
 // each item has the key -log(u) / weight, u uniform in (0, 1), and those with the smallest keys are chosen.
@@ -147,6 +132,10 @@ struct KeysUpTo {
 };
 
 namespace BLITZGS_BACKEND {
+void copy_rows(const CopyRows&, CudaStream);
+void clear_flag(std::int32_t* bad, CudaStream);
+template <class T>
+void check_columns(const CheckedColumns<T>&, CudaStream);
 void key_histogram(const KeyHistogram&, CudaStream);
 void find_digit(const FindDigit&, CudaStream);
 }  // namespace BLITZGS_BACKEND

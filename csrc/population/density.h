@@ -1,11 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Density control: statistics of the gradients, the features of candidates, and the trees that score them.
 #pragma once
-#include <cmath>
-#include <cstdint>
-#include <limits>
-
-#include "common/kernel.h"
 #include "math/gaussian.h"
 #include "math/tiles.h"
 
@@ -46,12 +41,10 @@ struct DensityStats {
   T* grad_sum;               // [N]
   std::int32_t* grad_count;  // [N]
   T* max_radii;              // [N]
-  const std::int32_t* visible_ids;
-  const std::int32_t* splat_offsets;
+  const std::int32_t *visible_ids, *splat_offsets;
   const T* v_means2d;
   std::int64_t v_stride;
-  const T* conics;
-  const T* phi;
+  const T *conics, *phi;
   std::int64_t n;
   T half_width, half_height, weight;
 

@@ -14,9 +14,7 @@
 // threads.
 #pragma once
 #include <cmath>
-#include <cstdint>
 
-#include "common/kernel.h"
 #include "common/rows.h"
 #include "math/morton.h"
 

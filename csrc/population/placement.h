@@ -3,10 +3,7 @@
 // are opening brackets in the order of their blocks, and new Gaussians closing ones, behind those of the same
 // block; a bracket and the one that closes it get the same row.
 #pragma once
-#include <cstdint>
-
 #include "active/view_gate.h"
-#include "common/kernel.h"
 
 namespace blitzgs {
 

@@ -1,11 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
-#include <atomic>
-#include <cstring>
-#include <limits>
 #include <utility>
 
-#include "common/parallel.h"
 #include "population/columns.h"
 #include "population/density.h"
 #include "population/knn.h"

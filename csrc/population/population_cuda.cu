@@ -1,5 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-
 #include <cub/cub.cuh>
 
 #include "common/cuda.cuh"
@@ -12,7 +11,6 @@
 #include "population/relocation.h"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 constexpr int kThreads = 256, kBlocks = 512;

@@ -1,9 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
-#include <cmath>
-#include <limits>
-#include <vector>
-
 #include "common/catch.h"
 #include "population/density.h"
 #include "population/knn.h"

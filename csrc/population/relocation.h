@@ -2,10 +2,6 @@
 // Relocation (3DGS-MCMC, Kheradmand et al. 2024): draws the Gaussians that are copied, and shares what N
 // equal Gaussians at one place have, so that they look like one before (eq. 9).
 #pragma once
-#include <cmath>
-#include <cstdint>
-
-#include "common/kernel.h"
 #include "math/gaussian.h"
 #include "population/columns.h"
 

@@ -21,20 +21,17 @@
 //    that some view may see, with those views;
 // 2. write_splats (write_splats_cuda.cu) projects the listed pairs of a candidate and a view, counts the
 //    pairs that are splats, and writes the splats in order, in one launch;
-// 3. write_colors (project_cuda.cu) computes the colour of each splat.
+// 3. color_splats (project_cuda.cu) computes the colour of each splat.
 // Without a capacity, project() launches write_splats a second time, when it knows the number of splats.
 //
 // project_bwd (project_bwd_device.cuh on CUDA) visits each visible Gaussian once, recomputes its splats and
 // sums their gradients in splat order, so it needs no atomics and is deterministic. It sums the pose
 // gradients of a few Gaussians (on the CPU of a block) in T, and these sums in double, in a fixed order.
 #pragma once
-#include <cstddef>
-#include <cstdint>
 #include <functional>
 #include <variant>
 
 #include "adam/lazy_adam.h"
-#include "common/kernel.h"
 #include "math/tiles.h"
 #include "project/project_splat.h"
 
@@ -249,7 +246,7 @@ void project(const ProjectInputs<T>&, const RankTiles&, const ProjectSizes* capa
 // Computes the colours of the splats that project() wrote without `sh`, and hides those whose colour is not
 // finite. It reads the means, the SH and the cameras of its inputs, whose rows `gaussian_ids` counts, and
 // writes colors, opacities, radii and tiles_touched; other columns may be null. It does nothing if there are
-// more splats than the capacity. On the CPU the sizes of the capacity are the actual numbers.
+// more splats than the capacity, or no `sh`. On the CPU the sizes of the capacity are the actual numbers.
 template <class T>
 void color_splats(const ProjectInputs<T>&, const ProjectCapacity&, const ProjectColumns<T>&, CudaStream);
 template <class T>

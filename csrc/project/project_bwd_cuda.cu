@@ -4,7 +4,6 @@
 #include "project/project_bwd_device.cuh"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 constexpr int kPoseThreads = 256;
@@ -141,10 +140,8 @@ void zero_arrays<float>(const ZeroedArrays<float>& arrays, CudaStream stream) {
   std::int64_t most = 0;
   for (const std::int64_t length : arrays.length) most = length > most ? length : most;
   if (most == 0) return;
-  const unsigned at_a_time = 8u * static_cast<unsigned>(multiprocessors());
-  const std::int64_t needed = (most + 4 * kZeroThreads - 1) / (4 * kZeroThreads);
-  const unsigned blocks = needed < at_a_time ? static_cast<unsigned>(needed) : at_a_time;
-  launch_early("project_bwd", zero_arrays_kernel, {blocks, kZeroThreads, stream}, arrays);
+  launch_early("project_bwd", zero_arrays_kernel,
+               {resident_blocks(most, 4 * kZeroThreads, 8), kZeroThreads, stream}, arrays);
 }
 
 template <>

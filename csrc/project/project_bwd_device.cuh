@@ -2,7 +2,6 @@
 // The kernel of the projection's backward pass on CUDA. It gives the gradients of the parameters to a sink:
 // that of project_bwd_cuda.cu stores them, that of project_step_cuda.cu takes the optimiser's step with them.
 #pragma once
-#include "common/cuda.cuh"
 #include "project/project.h"
 #include "project/project_device.cuh"
 

@@ -1,6 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
-#include <cmath>
 #include <mutex>
 #include <utility>
 #include <vector>
@@ -246,18 +244,6 @@ void zero_arrays(const ZeroedArrays<T>& arrays, CudaStream) {
   for (int a = 0; a < ZeroedArrays<T>::kCount; ++a) parallel_zero(arrays.begin[a], arrays.length[a]);
 }
 
-#define BLITZGS_INSTANTIATE(T)                                                                              \
-  template void project<T>(const ProjectInputs<T>&, const RankTiles&, const ProjectSizes*,                  \
-                           const SplatMemory<T>&, std::int64_t*, Workspace&, CudaStream);                   \
-  template void color_splats<T>(const ProjectInputs<T>&, const ProjectCapacity&, const ProjectColumns<T>&,  \
-                                CudaStream);                                                                \
-  template void project_bwd<T>(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&,  \
-                               const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream); \
-  template void zero_arrays<T>(const ZeroedArrays<T>&, CudaStream);
-BLITZGS_INSTANTIATE(float)
-BLITZGS_INSTANTIATE(double)
-#undef BLITZGS_INSTANTIATE
-
 template <class T>
 void project_bwd_step(const ProjectInputs<T>& in, const SplatIndex& splats, const SplatGradientColumns<T>& v,
                       const Regularisers<T>& regularisers, AdamArgs<T> adam, Workspace& workspace,
@@ -267,11 +253,15 @@ void project_bwd_step(const ProjectInputs<T>& in, const SplatIndex& splats, cons
   lazy_adam(adam, workspace, stream);
 }
 
-template void project_bwd_step<float>(const ProjectInputs<float>&, const SplatIndex&,
-                                      const SplatGradientColumns<float>&, const Regularisers<float>&,
-                                      AdamArgs<float>, Workspace&, CudaStream);
-template void project_bwd_step<double>(const ProjectInputs<double>&, const SplatIndex&,
-                                       const SplatGradientColumns<double>&, const Regularisers<double>&,
-                                       AdamArgs<double>, Workspace&, CudaStream);
+template decltype(project<float>) project<float>;
+template decltype(project<double>) project<double>;
+template decltype(color_splats<float>) color_splats<float>;
+template decltype(color_splats<double>) color_splats<double>;
+template decltype(project_bwd<float>) project_bwd<float>;
+template decltype(project_bwd<double>) project_bwd<double>;
+template decltype(zero_arrays<float>) zero_arrays<float>;
+template decltype(zero_arrays<double>) zero_arrays<double>;
+template decltype(project_bwd_step<float>) project_bwd_step<float>;
+template decltype(project_bwd_step<double>) project_bwd_step<double>;
 
 }  // namespace blitzgs::cpu

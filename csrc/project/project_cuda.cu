@@ -2,14 +2,12 @@
 // The projection on CUDA: the prefilter of all candidates (kernel 1 of project.h), the colours of the splats
 // (kernel 3), and project(), which queues the three kernels. Compiled without FMA contraction
 // (cmake/cuda.cmake), as write_splats_cuda.cu.
-#include "common/cuda.cuh"
 #include "common/rows.h"
 #include "math/frustum.h"
 #include "project/project_device.cuh"
 #include "project/unscented.h"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 constexpr int kWarps = kPrefilterThreads / 32, kMaxWarpCandidates = kMaxAtOnce / kWarps;
@@ -185,8 +183,6 @@ __global__ void __launch_bounds__(kColorThreads, kColorBlocks)
   }
 }
 
-}  // namespace
-
 void prefilter(const Inputs& in, const Prefiltered& kept, Workspace& workspace, CudaStream stream) {
   const std::int64_t turns = in.n_views > 0 ? most_prefilter_turns(in.n_candidates) : 0;
   if (turns == 0) {
@@ -198,8 +194,11 @@ void prefilter(const Inputs& in, const Prefiltered& kept, Workspace& workspace, 
   check_launch("project");
 }
 
-void write_colors(const Inputs& in, const ProjectCapacity& capacity, const ProjectColumns<float>& columns,
-                  CudaStream stream) {
+}  // namespace
+
+template <>
+void color_splats<float>(const Inputs& in, const ProjectCapacity& capacity,
+                         const ProjectColumns<float>& columns, CudaStream stream) {
   if (capacity.sizes.splats == 0 || !in.sh) return;
   const unsigned blocks = blocks_for(capacity.sizes.splats, kSplatsOfBlock);
   dispatch_sh(in, [&](auto degree, auto quads) {
@@ -218,7 +217,7 @@ void project<float>(const Inputs& in, const RankTiles& rank_tiles, const Project
   if (capacity) {
     const ProjectColumns<float> columns = memory(*capacity);
     write_splats(in, rank_tiles, kept, *capacity, columns, totals, workspace, stream);
-    write_colors(in, {*capacity, totals}, columns, stream);
+    color_splats(in, {*capacity, totals}, columns, stream);
     return;
   }
   write_splats(in, rank_tiles, kept, {0, 0}, {}, totals, workspace, stream);
@@ -226,13 +225,7 @@ void project<float>(const Inputs& in, const RankTiles& rank_tiles, const Project
   const auto sizes = read_back("project", reinterpret_cast<const ProjectSizes*>(totals), stream);
   const ProjectColumns<float> columns = memory(sizes);
   write_splats(in, rank_tiles, kept, sizes, columns, nullptr, workspace, stream);
-  write_colors(in, {sizes, nullptr}, columns, stream);
-}
-
-template <>
-void color_splats<float>(const Inputs& in, const ProjectCapacity& capacity,
-                         const ProjectColumns<float>& columns, CudaStream stream) {
-  write_colors(in, capacity, columns, stream);
+  color_splats(in, {sizes, nullptr}, columns, stream);
 }
 
 // The unscented projection.

@@ -2,9 +2,6 @@
 // Device code that the forward and backward kernels of the CUDA projection share: cameras in shared memory,
 // loads of parameters, and stages through which a warp moves rows between global memory and its lanes.
 #pragma once
-#include <cstdint>
-#include <type_traits>
-
 #include "common/cuda.cuh"
 #include "project/project.h"
 
@@ -274,11 +271,8 @@ struct Prefiltered {
   }
 };
 
-void prefilter(const Inputs&, const Prefiltered&, Workspace&, CudaStream);
 // totals: null if the caller knows them already. With a capacity of 0 splats the kernel only counts.
 void write_splats(const Inputs&, const RankTiles&, const Prefiltered&, const ProjectSizes& capacity,
                   const ProjectColumns<float>&, std::int64_t* totals, Workspace&, CudaStream);
-// Computes the colours of the splats that write_splats wrote. Does nothing without sh.
-void write_colors(const Inputs&, const ProjectCapacity&, const ProjectColumns<float>&, CudaStream);
 
 }  // namespace blitzgs::cuda

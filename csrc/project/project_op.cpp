@@ -1,11 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "project/project.h"
 
-#include <array>
-#include <tuple>
-
 #include "adam/lazy_adam_op.h"
-#include "common/op.h"
 #include "project/project_op.h"
 
 namespace blitzgs {

@@ -4,9 +4,6 @@
 // kernels must be compiled without FMA contraction, because two launches that project the same splat
 // (counting, then writing) must get the same bits.
 #pragma once
-#include <cstdint>
-
-#include "common/kernel.h"
 #include "math/frustum.h"
 #include "math/gaussian.h"
 #include "math/projection.h"

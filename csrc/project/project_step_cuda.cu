@@ -5,7 +5,6 @@
 #include "project/project_bwd_device.cuh"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 constexpr int kPacks = 12;  // packs of four floats in an SH row of degree 3

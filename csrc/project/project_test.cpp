@@ -3,7 +3,6 @@
 
 #include <numeric>
 #include <random>
-#include <vector>
 
 #include "common/catch.h"
 

@@ -1,9 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "project/unscented.h"
 
-#include <cmath>
-
-#include "common/op.h"
 #include "project/project_op.h"
 
 namespace blitzgs {

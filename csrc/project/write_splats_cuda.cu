@@ -2,13 +2,10 @@
 // Kernel 2 of the projection (project.h): projects the pairs of a Gaussian and a view that the prefilter
 // kept, decides which of them are splats, and writes the splats in order. Compiled without FMA contraction
 // (cmake/cuda.cmake), because a splat that is projected in two launches must get the same bits in both.
-#include <algorithm>
 
-#include "common/cuda.cuh"
 #include "project/project_device.cuh"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 constexpr int kWarps = kSplatThreads / 32, kBlocksPerMultiprocessor = 6;

@@ -2,9 +2,6 @@
 // Code that two CUDA passes share: the forward pass of the rasteriser (rasterize_fwd_cuda.cu) and the
 // contributions of splats (importance_cuda.cu). It packs the splats, orders the tiles and composites a pixel.
 #pragma once
-#include <cstdint>
-
-#include "common/cuda.cuh"
 #include "rasterize/tile_batch.cuh"
 
 namespace blitzgs::cuda {

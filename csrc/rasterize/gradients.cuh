@@ -6,10 +6,7 @@
 // g dx^2 and so on are moments of g over the pixel grid.
 #pragma once
 #include <cub/device/device_radix_sort.cuh>
-#include <stdexcept>
-#include <string>
 
-#include "common/cuda.cuh"
 #include "rasterize/tile_batch.cuh"
 
 namespace blitzgs::cuda {
@@ -188,8 +185,7 @@ inline __global__ void sum_entries_kernel(const std::int32_t* sorted_splats, con
 
 // The list entries sorted by splat: the splat and the position in the list of each, [n].
 struct EntriesBySplat {
-  std::int32_t* splats;
-  std::int32_t* entries;
+  std::int32_t *splats, *entries;
 };
 
 inline EntriesBySplat sort_entries(const std::int32_t* isect_splats, std::int64_t n, std::int64_t n_splats,

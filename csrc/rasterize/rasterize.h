@@ -39,19 +39,13 @@
 // tile, and these are added in the order of the tiles. The CUDA gradient is repeatable if `deterministic` is
 // set. The cost is O(entries processed x pixels of the splat).
 #pragma once
-#include <cstdint>
-
-#include "common/kernel.h"
 #include "math/tiles.h"
 
 namespace blitzgs {
 
 template <class T>
 struct RasterizeInput {
-  const T* means2d;
-  const T* conics;
-  const T* opacities;
-  const T* colors;
+  const T *means2d, *conics, *opacities, *colors;
   const T* backgrounds;  // null: black
   const std::int32_t* isect_splats;
   const std::int64_t* tile_offsets;
@@ -63,10 +57,8 @@ struct RasterizeInput {
 
 template <class T>
 struct RasterizeOutput {
-  T* renders;
-  T* transmittances;
-  std::int32_t* last_ids;
-  std::int32_t* tile_work;
+  T *renders, *transmittances;
+  std::int32_t *last_ids, *tile_work;
   T* splat_gradients;  // null, or [P] SplatGradient that forward sets to zero (CUDA, up to four channels)
   bool clear_rest;
 };
@@ -81,10 +73,7 @@ struct RasterizeSaved {
 
 template <class T>
 struct RasterizeGradients {
-  T* v_means2d;
-  T* v_conics;
-  T* v_opacities;
-  T* v_colors;
+  T *v_means2d, *v_conics, *v_opacities, *v_colors;
   T* v_means2d_abs;  // null: not wanted
 };
 
@@ -99,26 +88,6 @@ struct RasterizeAux {
   std::int32_t* order;  // [1 + composited, kTileOrderClasses] of tile_order.cuh; null: tiles by their numbers
   std::int64_t composited;  // the number of composited tiles
 };
-
-namespace BLITZGS_BACKEND {
-std::int64_t rasterize_splat_bytes(int n_channels);
-// Whether forward leaves an order of the tiles that it composites.
-bool rasterize_orders_tiles(const TileGrid& grid);
-template <class T>
-void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, const RasterizeAux& aux,
-                   Workspace&, CudaStream);
-template <class T>
-void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, std::int64_t n_isects,
-                   const RasterizeAux& aux, bool deterministic, const RasterizeGradients<T>& gradients,
-                   Workspace&, CudaStream);
-}  // namespace BLITZGS_BACKEND
-
-namespace cuda {
-// rasterize_bwd that adds the gradients to the table `packed` [P] of SplatGradient.
-void rasterize_bwd_packed(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
-                          std::int64_t n_isects, const RasterizeAux& aux, bool deterministic, bool absolute,
-                          float* packed, Workspace&, CudaStream);
-}  // namespace cuda
 
 // Which splats each pixel composites. Compositing is as above, without colours, so alpha and T of
 // a pixel have the bits with which the backend renders it (with the same tile size). Per pixel, over the
@@ -149,6 +118,20 @@ struct PixelSplats {
 };
 
 namespace BLITZGS_BACKEND {
+std::int64_t rasterize_splat_bytes(int n_channels);
+// Whether forward leaves an order of the tiles that it composites.
+bool rasterize_orders_tiles(const TileGrid& grid);
+template <class T>
+void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, const RasterizeAux& aux,
+                   Workspace&, CudaStream);
+template <class T>
+void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, std::int64_t n_isects,
+                   const RasterizeAux& aux, bool deterministic, const RasterizeGradients<T>& gradients,
+                   Workspace&, CudaStream);
+// (CUDA) rasterize_bwd that adds the gradients to the table `packed` [P] of SplatGradient.
+void rasterize_bwd_packed(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
+                          std::int64_t n_isects, const RasterizeAux& aux, bool deterministic, bool absolute,
+                          float* packed, Workspace&, CudaStream);
 template <class T>
 void pixel_splats(const RasterizeInput<T>& in, const PixelSplats<T>& out, Workspace&, CudaStream);
 }  // namespace BLITZGS_BACKEND
@@ -190,5 +173,4 @@ BLITZGS_HD T keep_strongest(std::int32_t* ids, T* weights, int most, std::int32_
 }
 
 }  // namespace
-
 }  // namespace blitzgs

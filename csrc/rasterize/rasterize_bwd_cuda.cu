@@ -5,11 +5,9 @@
 // from the forward pass. The half-warp writes w and g (rasterize.h) of sixteen entries to shared memory. Each
 // lane then sums over the sixteen pixels for one of the entries (gradients.cuh).
 
-#include "common/cuda.cuh"
 #include "rasterize/gradients.cuh"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 struct BackwardArguments : ChunkInput {

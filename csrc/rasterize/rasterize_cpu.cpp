@@ -1,13 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
-#include <vector>
-
-#include "common/parallel.h"
 #include "rasterize/rasterize.h"
 #include "rasterize/tile_jobs.h"
 
 namespace blitzgs::cpu {
-
 namespace {
 
 // The number of partial gradients (one per splat and tile) in memory at a time: a few megabytes, so that they
@@ -161,16 +156,6 @@ void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, 
   write_gradients(in, sums, width, gradients);
 }
 
-#define BLITZGS_INSTANTIATE(T)                                                                             \
-  template void rasterize_fwd<T>(const RasterizeInput<T>&, const RasterizeOutput<T>&, const RasterizeAux&, \
-                                 Workspace&, CudaStream);                                                  \
-  template void rasterize_bwd<T>(const RasterizeInput<T>&, const RasterizeSaved<T>&, std::int64_t,         \
-                                 const RasterizeAux&, bool, const RasterizeGradients<T>&, Workspace&,      \
-                                 CudaStream);
-BLITZGS_INSTANTIATE(float)
-BLITZGS_INSTANTIATE(double)
-#undef BLITZGS_INSTANTIATE
-
 template <class T>
 void pixel_splats(const RasterizeInput<T>& in, const PixelSplats<T>& out, Workspace& workspace, CudaStream) {
   for_each_colorless_tile(in, workspace, [&](const TileKernels<T>& kernels, const TileJob<T>& tile) {
@@ -178,9 +163,11 @@ void pixel_splats(const RasterizeInput<T>& in, const PixelSplats<T>& out, Worksp
   });
 }
 
-template void pixel_splats<float>(const RasterizeInput<float>&, const PixelSplats<float>&, Workspace&,
-                                  CudaStream);
-template void pixel_splats<double>(const RasterizeInput<double>&, const PixelSplats<double>&, Workspace&,
-                                   CudaStream);
+template decltype(rasterize_fwd<float>) rasterize_fwd<float>;
+template decltype(rasterize_fwd<double>) rasterize_fwd<double>;
+template decltype(rasterize_bwd<float>) rasterize_bwd<float>;
+template decltype(rasterize_bwd<double>) rasterize_bwd<double>;
+template decltype(pixel_splats<float>) pixel_splats<float>;
+template decltype(pixel_splats<double>) pixel_splats<double>;
 
 }  // namespace blitzgs::cpu

@@ -1,9 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "common/cuda.cuh"
 #include "rasterize/forward.cuh"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 struct ForwardArguments : ChunkInput {

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "rasterize/rasterize_op.h"
 
-#include <tuple>
-
 namespace blitzgs {
 namespace {
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // What the ops that composite splats share: the checked splats, and the ops that others call.
 #pragma once
-#include <algorithm>
-
 #include "common/op.h"
 #include "rasterize/rasterize.h"
 

@@ -8,12 +8,6 @@
 // pixels touches about three subtiles. The two halves of a warp visit different lists in lockstep. The test
 // is conservative, so it changes no pixel.
 #pragma once
-#include <algorithm>
-#include <cstdint>
-#include <stdexcept>
-#include <string>
-
-#include "common/cuda.cuh"
 #include "math/tiles.h"
 #include "rasterize/rasterize.h"
 #include "rasterize/tile_order.cuh"

@@ -6,10 +6,6 @@
 #pragma once
 #include <algorithm>
 #include <atomic>
-#include <bit>
-#include <cmath>
-#include <cstddef>
-#include <cstdint>
 
 #include "importance/importance.h"
 #include "math/lanes.h"

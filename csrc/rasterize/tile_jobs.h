@@ -1,10 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // The code that calls the CPU tile kernels: it prepares the splats and describes the tiles as jobs.
 #pragma once
-#include <algorithm>
-#include <cmath>
-#include <type_traits>
-
 #include "common/parallel.h"
 #include "rasterize/rasterize.h"
 #include "rasterize/tile_kernels.h"

@@ -8,9 +8,6 @@
 // from the first pixel inside the ellipse. The state of the pixels is in scratch planes that fit the
 // first-level cache. Rows are padded so that eight pixels can be loaded from any pixel of the row.
 #pragma once
-#include <algorithm>
-#include <bit>
-#include <cstdint>
 #include <vector>
 
 #include "rasterize/tile_forward.h"

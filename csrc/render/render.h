@@ -2,9 +2,6 @@
 // What a call needs beyond the projection (project.h), intersect (intersect.h) and rasterize_fwd
 // (rasterize.h): rows of the visible Gaussians, alphas, and splats in the arrangement of `meta`.
 #pragma once
-#include <cstdint>
-
-#include "common/kernel.h"
 #include "project/project.h"
 
 namespace blitzgs {

@@ -4,7 +4,6 @@
 #include "render/render.h"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 constexpr int kThreads = 256;

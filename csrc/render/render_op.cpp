@@ -1,9 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "render/render.h"
 
-#include <functional>
 #include <numeric>
-#include <tuple>
 
 #include "project/project_op.h"
 #include "rasterize/rasterize_op.h"

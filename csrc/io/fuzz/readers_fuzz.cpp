@@ -4,11 +4,6 @@
 // sanitizers stop the program if it reads beyond the input, and libFuzzer stops it if it hangs or allocates
 // too much.
 #include <cstddef>
-#include <cstdint>
-#include <span>
-#include <sstream>
-#include <string>
-#include <vector>
 
 #include "io/colmap.h"
 #include "io/image_file.h"
