@@ -14,8 +14,8 @@
 namespace blitzgs {
 namespace {
 
-std::vector<std::int64_t> splat_gradient_layout() {
-  constexpr std::int64_t kFloat = sizeof(float);
+std::vector<int64_t> splat_gradient_layout() {
+  constexpr int64_t kFloat = sizeof(float);
   return {offsetof(SplatGradient, mean2d) / kFloat,     offsetof(SplatGradient, conic) / kFloat,
           offsetof(SplatGradient, opacity) / kFloat,    offsetof(SplatGradient, color) / kFloat,
           offsetof(SplatGradient, mean2d_abs) / kFloat, kSplatGradient};
@@ -238,11 +238,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "visible_ids, Tensor splat_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int "
       "height, float weight) -> ()");
 
-  // Noise on the means of almost transparent Gaussians.
   m.def(
       "position_noise_(Tensor(a!) means, Tensor quats, Tensor scales, Tensor opacities, Tensor ids, Tensor "
       "visible_ids, int seed, int step, float threshold, float strength) -> ()");
-  // A limit of the size of Gaussians.
   m.def(
       "limit_scales_(Tensor(a!) scales, Tensor means, Tensor visible_ids, float share, float extent) -> ()");
 
@@ -303,7 +301,6 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // A number that is 0 if all values of the columns are finite and none of `nonzero` is 0.
   m.def("find_non_finite(Tensor[] columns, Tensor[] nonzero) -> Tensor");
 
-  // Scene initialisation.
   m.def("knn_distances(Tensor points, int k) -> Tensor");
 }
 

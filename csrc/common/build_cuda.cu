@@ -24,8 +24,6 @@ __attribute__((visibility("default"))) int blitzgs_sm90_branches() {
 __attribute__((visibility("default"))) int blitzgs_sm80_forced() { return BLITZGS_SM80_BRANCHES; }
 
 // Returns the number of items from which sorts take 64-bit states.
-__attribute__((visibility("default"))) std::int64_t blitzgs_small_states() {
-  return blitzgs::cuda::kSmallStates;
-}
+__attribute__((visibility("default"))) int64_t blitzgs_small_states() { return blitzgs::cuda::kSmallStates; }
 
 }  // extern "C"

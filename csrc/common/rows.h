@@ -17,7 +17,7 @@ void for_each_row(const Rows& work, CudaStream)
     ;
 #else
 {
-  parallel_rows(work.n, 4096, [&](std::int64_t i) { work(i); });
+  parallel_rows(work.n, 4096, [&](int64_t i) { work(i); });
 }
 #endif
 
@@ -28,11 +28,10 @@ namespace blitzgs::cuda {
 
 inline constexpr int kRowThreads = 256;
 
-// One thread per row.
 template <class Rows>
 static __global__ void __launch_bounds__(kRowThreads) row_kernel(const __grid_constant__ Rows work) {
   wait_for_earlier_kernels();
-  const std::int64_t i = blockIdx.x * std::int64_t{kRowThreads} + threadIdx.x;
+  const int64_t i = blockIdx.x * int64_t{kRowThreads} + threadIdx.x;
   if (i < work.n) work(i);
 }
 

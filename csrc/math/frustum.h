@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 // A conservative test whether a view may see a Gaussian, from its mean and an upper bound sigma on its
-// standard deviations. Three callers use these planes: the tests of table blocks and of their rows
-// (active/blocks.h) and the prefilter of the projection (project/project_cuda.cu).
+// standard deviations, for blocks and rows of the table (active/blocks.h) and the prefilter of the
+// projection.
 //
 // A Gaussian with axes up to sigma cannot be seen iff its mean lies behind the near plane, beyond the far
 // plane, or beyond one image border by more than a splat can reach: half-width of alpha >= 1/255 is at most
 // sqrt(2 ln 255) sqrt(|J row|^2 sigma^2 + eps2d) pixels for an opacity of at most 1, with |J row| <= f / z
-// max |row_x - u row_z| over the clamped slopes u. Multiplied by z, each condition is a linear inequality
-// n . p + d + k sigma >= 0.
+// max |row_x - u row_z| over the clamped slopes u. Multiplied by z, each condition is a linear inequality n .
+// p + d + k sigma >= 0.
 #pragma once
 #include "math/projection.h"
 #include "math/vec.h"
@@ -31,7 +31,6 @@ struct Frustum {
 
 namespace frustum {
 
-// A row of the world-to-camera transform.
 struct PoseRow {
   double n[3], offset;
 };
@@ -47,12 +46,12 @@ BLITZGS_HD FrustumPlane make_plane(const PoseRow& row, double factor, const Pose
   FrustumPlane plane;
   float largest = 0.0f;
   for (int axis = 0; axis < 3; ++axis) {
-    plane.n[axis] = static_cast<float>(factor * row.n[axis] + factor_z * row_z.n[axis]);
+    plane.n[axis] = float(factor * row.n[axis] + factor_z * row_z.n[axis]);
     largest = larger(largest, std::fabs(plane.n[axis]));
   }
-  plane.d = static_cast<float>(factor * row.offset + factor_z * row_z.offset + shift);
+  plane.d = float(factor * row.offset + factor_z * row_z.offset + shift);
   plane.d_high = plane.d + kPointSlack * std::fabs(plane.d);
-  plane.k = static_cast<float>(k);
+  plane.k = float(k);
   plane.n_error = kPointSlack * largest;
   return plane;
 }

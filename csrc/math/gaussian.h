@@ -6,8 +6,6 @@
 
 #include "math/vec.h"
 
-// Rotations from unnormalised quaternions (w, x, y, z), and the derivative.
-
 namespace blitzgs {
 
 // The three columns of a 3x3 matrix: the images of the unit axes.
@@ -22,9 +20,9 @@ struct UnitQuaternion {
   T inverse_norm;  // 1 / |q| of the quaternion it came from; 0 when that was zero
 };
 
-// A quaternion of zeros gives the identity, with a gradient of zero, and so does one that is so short that
-// its inverse norm would overflow. The squares of very large or very small components leave the range of
-// float, so such quaternions are first divided by their largest component.
+// A quaternion of zeros, or one so short that its inverse norm would overflow, gives the identity and a
+// gradient of zero. The squares of very large or small components leave the range of float, so such
+// quaternions are first divided by their largest component.
 template <class T>
 BLITZGS_HD UnitQuaternion<T> normalize_quaternion(const T* q) {
   T scale = T(1);

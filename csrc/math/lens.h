@@ -13,8 +13,8 @@
 //
 // A rolling shutter sees the first row (or column) at the time 0 and the last one at 1. The time of a point
 // is found in at most 20 steps from its pixel at the begin of the frame, or at the end where only this one is
-// valid. Unlike gsplat's, it is not rounded to that of a row: there a 2D splat only bounds what is evaluated
-// in 3D, while here the pixels of close points are subtracted, which would leave the rounding.
+// valid. Unlike gsplat's it is not rounded to that of a row, because differences of close pixels would keep
+// the rounding.
 #pragma once
 #include "math/projection.h"
 

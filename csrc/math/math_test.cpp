@@ -179,8 +179,8 @@ float exp2_of(float x) { return blitzgs::exp2_nonpositive(Lanes::broadcast(x)).v
 TEST_CASE("2^x is accurate to an ulp for x <= 0") {
   double worst = 0;
   for (int i = 0; i <= 400000; ++i) {
-    const float x = -126.0f * static_cast<float>(i) / 400000.0f;
-    const double exact = std::exp2(static_cast<double>(x));
+    const float x = -126.0f * float(i) / 400000.0f;
+    const double exact = std::exp2(double(x));
     worst = std::max(worst, std::fabs(exp2_of(x) - exact) / exact);
   }
   REQUIRE(worst < 1.1e-7);

@@ -23,10 +23,9 @@ struct Camera {
 };
 
 // viewmat [4, 4] and K [3, 3] row-major. The slopes leave 0.15 of the image size beyond each border, which is
-// 1.3 tan(fov / 2) for a centred principal point. The centre assumes a rotation: c = -W^T t. A skew, or
-// another last row of K than 0, 0, 1, beyond rounding has no place in the projection: such a camera sees
-// nothing, as one that is not finite. Whoever finds the view empty looks at its camera, which costs the
-// others no look.
+// 1.3 tan(fov / 2) for a centred principal point. The centre assumes a rotation: c = -W^T t. A camera with a
+// skew, or another last row of K than 0, 0, 1, has no place in the projection: beyond rounding, it sees
+// nothing, as one that is not finite.
 template <class T>
 BLITZGS_HD Camera<T> make_camera(const T* viewmat, const T* K, int width, int height) {
   Camera<T> camera;
@@ -140,11 +139,10 @@ BLITZGS_HD Footprint<T> make_footprint(const PixelGradients<T>& g, const Columns
   return s;
 }
 
-// Writes the conic (a, b, c) to conic [3]. The length of a splat along its axis depends on ac - b^2. Rounding
-// a, b and c to float changes that difference by up to ac / (ac - b^2) roundings, which is 1e-3 of it for a
-// splat that is a hundred times longer than wide. The function therefore tries floats next to a, scales b
-// with a (the axis has the direction (-b, a)), and keeps the pair for which some float c gives the best
-// determinant.
+// Writes the conic (a, b, c) to conic [3]. The length of a splat depends on ac - b^2, which rounding to float
+// changes by up to ac / (ac - b^2) roundings: 1e-3 for a splat a hundred times longer than wide. The function
+// therefore tries floats next to a, scales b with a (the axis has the direction (-b, a)), and keeps the pair
+// for which some float c gives the best determinant.
 template <class T>
 BLITZGS_HD void store_conic(const Footprint<T>& s, T* conic) {
   for (int i = 0; i < 3; ++i) conic[i] = s.conic[i];

@@ -1,20 +1,19 @@
 // SPDX-License-Identifier: Apache-2.0
-// The test of which tiles a splat touches (docs/image.md, section 3). The projection counts tiles by it and
-// the intersection lists them by it, on every backend.
+// The test of which tiles a splat touches (docs/image.md, section 3): the projection counts tiles by it and
+// the intersection lists them, on every backend.
 //
 // A splat is composited where opacity * exp(-q/2) >= 1/255 with q = a dx^2 + 2 b dx dy + c dy^2, that is
-// inside the ellipse q <= 2 ln(255 opacity). Consider the band of pixel centres of one row of tiles. The part
-// of the ellipse in this band spans an interval of x, whose ends have a closed form: the interval is widest
-// at the turning point of the ellipse, clamped to the band. The splat touches the tiles of the row with a
-// pixel column in this interval. The cost is O(tile rows).
+// inside the ellipse q <= 2 ln(255 opacity). Its part in the band of pixel centres of one row of tiles spans
+// an interval of x, whose ends have a closed form: the turning point of the ellipse, clamped to the band. The
+// splat touches the tiles of the row with a pixel column in this interval. The cost is O(tile rows).
 //
 // The test is conservative: the ellipse is enlarged by a relative and absolute 2e-5 in q, and the interval by
-// some float roundings. This covers the rounding of the test itself and of the rasterisers, which evaluate q
-// as factor_conic() writes it. A tile that is not listed therefore gets no contribution from the splat. A
-// splat that is not finite, not convex (a <= 0 or c <= 0) or too faint (opacity < 1/255) touches no tile.
+// some float roundings. This covers the rounding of the test and of the rasterisers, which evaluate q as
+// factor_conic() writes it. A splat that is not finite, not convex (a <= 0 or c <= 0) or too faint (opacity <
+// 1/255) touches no tile.
 //
-// Every kernel must count the same tiles, because the count of one kernel is the buffer size of another. The
-// expressions here therefore use mul() and mul_add(), which the compiler cannot contract differently.
+// The count of one kernel is the buffer size of another, so the expressions here use mul() and mul_add(),
+// which no compiler contracts differently.
 #pragma once
 #include "math/vec.h"
 
@@ -28,15 +27,15 @@ constexpr double kMinTransmittance = 1e-4;  // a pixel ends before its transmitt
 // [tile_begin, tile_end) are owned: the others are not listed, and their pixels are zero.
 struct TileGrid {
   int n_cameras, width, height, tile_size, tiles_x, tiles_y;
-  std::int64_t tile_begin, tile_end;
+  int64_t tile_begin, tile_end;
 
-  BLITZGS_HD std::int64_t per_image() const { return static_cast<std::int64_t>(tiles_x) * tiles_y; }
-  BLITZGS_HD std::int64_t count() const { return n_cameras * per_image(); }
+  BLITZGS_HD int64_t per_image() const { return int64_t(tiles_x) * tiles_y; }
+  BLITZGS_HD int64_t count() const { return n_cameras * per_image(); }
 };
 
 // tile_end < 0 means all tiles.
-BLITZGS_HD TileGrid make_tile_grid(int n_cameras, int width, int height, int tile_size,
-                                   std::int64_t tile_begin, std::int64_t tile_end) {
+BLITZGS_HD TileGrid make_tile_grid(int n_cameras, int width, int height, int tile_size, int64_t tile_begin,
+                                   int64_t tile_end) {
   const int tiles_x = (width + tile_size - 1) / tile_size;
   const int tiles_y = (height + tile_size - 1) / tile_size;
   TileGrid grid{n_cameras, width, height, tile_size, tiles_x, tiles_y, tile_begin, tile_end};
@@ -70,10 +69,9 @@ struct Divider {
 
 }  // namespace tiles
 
-// The factor L of conic = L^T L, so q = (l11 dx + l21 dy)^2 + (l22 dy)^2. This form is never negative, and it
-// is free of the cancellation in a dx^2 + 2 b dx dy + c dy^2 for thin splats. A conic that rounding made
-// indefinite gets l22 = 0: a splat that is so long is constant along its axis. The products of floats are
-// exact in double.
+// The factor L of conic = L^T L, so q = (l11 dx + l21 dy)^2 + (l22 dy)^2, which is never negative and does
+// not cancel for thin splats. A conic that rounding made indefinite gets l22 = 0: a splat that is so long is
+// constant along its axis. The products of floats are exact in double.
 template <class T>
 struct ConicFactor {
   T l11, l21, l22;
@@ -81,12 +79,12 @@ struct ConicFactor {
 
 template <class T>
 BLITZGS_HD double conic_determinant(const T* conic) {
-  const double b = static_cast<double>(conic[1]);
+  const double b = double(conic[1]);
   const double bb = b * b;
 #ifdef __CUDA_ARCH__
-  const double det = fma(static_cast<double>(conic[0]), static_cast<double>(conic[2]), -bb);
+  const double det = fma(double(conic[0]), double(conic[2]), -bb);
 #else
-  const double det = static_cast<double>(conic[0]) * static_cast<double>(conic[2]) - bb;
+  const double det = double(conic[0]) * double(conic[2]) - bb;
 #endif
   return det > 0.0 ? det : 0.0;
 }
@@ -96,7 +94,7 @@ BLITZGS_HD ConicFactor<T> factor_conic(const T* conic) {
   ConicFactor<T> factor;
   factor.l11 = std::sqrt(conic[0]);
   factor.l21 = conic[1] / factor.l11;
-  factor.l22 = std::sqrt(static_cast<T>(conic_determinant(conic) / static_cast<double>(conic[0])));
+  factor.l22 = std::sqrt(T(conic_determinant(conic) / double(conic[0])));
   return factor;
 }
 
@@ -115,21 +113,20 @@ struct SplatEllipse {
 template <class T>
 BLITZGS_HD bool make_ellipse(const T* conic, T opacity, SplatEllipse<T>* ellipse) {
   const T a = conic[0], b = conic[1], c = conic[2];
-  if (!(opacity >= static_cast<T>(kAlphaCut)) || !is_finite(opacity)) return false;
+  if (!(opacity >= T(kAlphaCut)) || !is_finite(opacity)) return false;
   if (!(a > T(0)) || !(c > T(0)) || !is_finite(a) || !is_finite(b) || !is_finite(c)) return false;
   const T exact = T(2) * std::log(T(255) * opacity);
   ellipse->cut = mul_add(exact > T(0) ? exact : T(0), T(1.00002), T(2e-5));
   const ConicFactor<T> factor = factor_conic(conic);
   if (!(factor.l11 > T(0))) return false;
-  // One division serves a / det and c / det, because a division in double costs as much as the rest of this
-  // function.
+  // One division serves both, because one in double costs as much as the rest of this function.
   const double det = conic_determinant(conic);
   const double inverse = 1.0 / det;
   ellipse->inv_l11 = T(1) / factor.l11;
   ellipse->shear = b / a;
   ellipse->l22 = factor.l22;
-  ellipse->half_height = std::sqrt(mul(ellipse->cut, static_cast<T>(static_cast<double>(a) * inverse)));
-  ellipse->half_width = std::sqrt(mul(ellipse->cut, static_cast<T>(static_cast<double>(c) * inverse)));
+  ellipse->half_height = std::sqrt(mul(ellipse->cut, T(double(a) * inverse)));
+  ellipse->half_width = std::sqrt(mul(ellipse->cut, T(double(c) * inverse)));
   ellipse->turn = b == T(0) ? T(0) : -(b / c) * ellipse->half_width;
   return is_finite(ellipse->shear) && is_finite(ellipse->inv_l11);
 }
@@ -138,8 +135,8 @@ BLITZGS_HD bool make_ellipse(const T* conic, T opacity, SplatEllipse<T>* ellipse
 // if there is none. A bound that is NaN is ignored.
 template <class T>
 BLITZGS_HD void pixels_between(T low, T high, int size, int* first, int* last) {
-  *first = static_cast<int>(std::ceil(tiles::clamp_nan_low(low - T(0.5), T(0), static_cast<T>(size))));
-  *last = static_cast<int>(std::floor(tiles::clamp_nan_high(high - T(0.5), T(-1), static_cast<T>(size - 1))));
+  *first = int(std::ceil(tiles::clamp_nan_low(low - T(0.5), T(0), T(size))));
+  *last = int(std::floor(tiles::clamp_nan_high(high - T(0.5), T(-1), T(size - 1))));
 }
 
 // Returns x at one end of the ellipse's interval over a band of rows. side is -1 for the left end and 1 for
@@ -172,7 +169,7 @@ struct TileRows {
     const int top = ty * tile_of.size, bottom = top + tile_of.size - 1;
     const int band_first = row_first > top ? row_first : top,
               band_last = row_last < bottom ? row_last : bottom;
-    const T low = static_cast<T>(band_first) + T(0.5) - y, high = static_cast<T>(band_last) + T(0.5) - y;
+    const T low = T(band_first) + T(0.5) - y, high = T(band_last) + T(0.5) - y;
     const T left = chord_end(ellipse, x, y, tiles::clamp_nan_low(-ellipse.turn, low, high), T(-1));
     const T right = chord_end(ellipse, x, y, tiles::clamp_nan_low(ellipse.turn, low, high), T(1));
     int column_first, column_last;
@@ -216,16 +213,16 @@ BLITZGS_HD void for_each_tile_row(const T* mean2d, const T* conic, T opacity, in
 // The tiles of each rank: rank m composites the flattened tiles [begin[m], end[m]) of all cameras. Ranges may
 // be empty and may overlap; their begins ascend.
 struct RankTiles {
-  std::int64_t begin[kMaxRanks], end[kMaxRanks];
+  int64_t begin[kMaxRanks], end[kMaxRanks];
   int n_ranks;
 };
 
 // Calls f(rank, tiles) for each rank that composites some of the tiles [begin, end).
 template <class F>
-BLITZGS_HD void for_each_rank(const RankTiles& ranks, std::int64_t begin, std::int64_t end, const F& f) {
+BLITZGS_HD void for_each_rank(const RankTiles& ranks, int64_t begin, int64_t end, const F& f) {
   for (int m = 0; m < ranks.n_ranks && ranks.begin[m] < end; ++m) {
-    const std::int64_t low = ranks.begin[m] > begin ? ranks.begin[m] : begin;
-    const std::int64_t high = ranks.end[m] < end ? ranks.end[m] : end;
+    const int64_t low = ranks.begin[m] > begin ? ranks.begin[m] : begin;
+    const int64_t high = ranks.end[m] < end ? ranks.end[m] : end;
     if (low < high) f(m, high - low);
   }
 }

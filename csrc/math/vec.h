@@ -49,7 +49,7 @@ BLITZGS_HD T reciprocal(T x) {
 // Maps floats to unsigned integers of the same order; -0 comes before 0.
 template <class T>
 BLITZGS_HD auto ordered_bits(T value) {
-  using Bits = std::conditional_t<sizeof(T) == 4, std::uint32_t, std::uint64_t>;
+  using Bits = std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t>;
   constexpr int kSign = 8 * sizeof(T) - 1;
   Bits bits;
   std::memcpy(&bits, &value, sizeof(bits));

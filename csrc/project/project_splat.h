@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The arithmetic of one splat, a Gaussian projected into a view, forward and backward (docs/image.md,
-// sections 1, 2 and 4). Both backends call these functions, so they compute the same splat. CUDA forward
-// kernels must be compiled without FMA contraction, because two launches that project the same splat
-// (counting, then writing) must get the same bits.
+// sections 1, 2 and 4), for both backends. CUDA forward kernels are compiled without FMA contraction, because
+// two launches that project the same splat must get the same bits.
 #pragma once
 #include "math/frustum.h"
 #include "math/gaussian.h"
@@ -96,8 +95,8 @@ BLITZGS_HD T level_weight(const Camera<T>& camera, const ActivatedGaussian<T>& g
 }
 
 template <class T>
-BLITZGS_HD std::int32_t pixel_radius(T extent) {
-  return static_cast<std::int32_t>(std::ceil(smaller(extent, T(1 << 30))));
+BLITZGS_HD int32_t pixel_radius(T extent) {
+  return int32_t(std::ceil(smaller(extent, T(1 << 30))));
 }
 
 // Sets the extent of a splat whose other values are known. Returns false if the splat does not exist.
@@ -134,22 +133,21 @@ BLITZGS_HD bool project_splat(const Camera<T>& camera, const ActivatedGaussian<T
 // Returns the number of tiles that a splat touches and sets *ranks to the ranks (as bits) that composite some
 // of them. Calls f(rank, number of tiles) for each piece of a tile row that one rank composites.
 template <class T, class F>
-BLITZGS_HD std::int32_t splat_tiles(const Splat<T>& splat, int view, const ProjectOptions<T>& options,
-                                    const RankTiles& rank_tiles, std::int64_t* ranks, const F& f) {
+BLITZGS_HD int32_t splat_tiles(const Splat<T>& splat, int view, const ProjectOptions<T>& options,
+                               const RankTiles& rank_tiles, int64_t* ranks, const F& f) {
   const int tiles_x = (options.width + options.tile_size - 1) / options.tile_size;
   const int tiles_y = (options.height + options.tile_size - 1) / options.tile_size;
-  const std::int64_t image = static_cast<std::int64_t>(view) * tiles_x * tiles_y;
-  std::int32_t count = 0;
-  std::int64_t wanted = 0;
+  const int64_t image = int64_t(view) * tiles_x * tiles_y;
+  int32_t count = 0;
+  int64_t wanted = 0;
   for_each_tile_row(splat.mean2d, splat.conic, splat.opacity, options.width, options.height,
                     options.tile_size, [&](int ty, int begin, int end) {
                       count += end - begin;
-                      const std::int64_t first = image + static_cast<std::int64_t>(ty) * tiles_x;
-                      for_each_rank(rank_tiles, first + begin, first + end,
-                                    [&](int rank, std::int64_t tiles) {
-                                      wanted |= std::int64_t{1} << rank;
-                                      f(rank, tiles);
-                                    });
+                      const int64_t first = image + int64_t(ty) * tiles_x;
+                      for_each_rank(rank_tiles, first + begin, first + end, [&](int rank, int64_t tiles) {
+                        wanted |= int64_t{1} << rank;
+                        f(rank, tiles);
+                      });
                     });
   *ranks = wanted;
   return count;
@@ -220,7 +218,6 @@ struct GeometryGradient {
   T mean2d[2], conic[3], depth, opacity;
 };
 
-// Gradients of an activated Gaussian, summed over its splats.
 template <class T>
 struct GaussianGradient {
   Vec3<T> mean;
@@ -258,7 +255,6 @@ BLITZGS_HD void smallest_axis_vjp(const Vec3<T>& scale, T weight, Vec3<T>* v_sca
   }
 }
 
-// Pointers to one Gaussian's rows of the gradient outputs.
 template <class T>
 struct ParameterGradients {
   T *mean, *quat, *scale, *opacity;

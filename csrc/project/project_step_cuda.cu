@@ -15,11 +15,11 @@ constexpr int kBatch = 4;   // packs that a lane has in flight
 struct StepRows {
   struct Shared {
     AdamStep<float> step;
-    std::int32_t ids[kBackwardThreads];
+    int32_t ids[kBackwardThreads];
     Decay decays[kBackwardThreads];
   };
   struct Own {
-    std::int32_t behind;  // pending steps by which the moments of this lane's Gaussian must decay first
+    int32_t behind;  // pending steps by which the moments of this lane's Gaussian must decay first
   };
   AdamArgs<float> adam;
 

@@ -45,14 +45,14 @@ struct World {
 
 struct Projected {
   ProjectSizes sizes{};
-  std::vector<std::int64_t> totals, rank_masks;
-  std::vector<std::int32_t> gaussian_ids, camera_ids, visible_ids, splat_offsets, radii, tiles;
+  std::vector<int64_t> totals, rank_masks;
+  std::vector<int32_t> gaussian_ids, camera_ids, visible_ids, splat_offsets, radii, tiles;
   std::vector<double> means2d, conics, depths, opacities, colors;
 
   ProjectColumns<double> allocate(const ProjectSizes& counted) {
     sizes = counted;
-    const std::size_t U = sizes.visible, P = sizes.splats;
-    const auto sized = [](auto& values, std::size_t size) {
+    const size_t U = sizes.visible, P = sizes.splats;
+    const auto sized = [](auto& values, size_t size) {
       values.resize(size);
       return values.data();
     };
@@ -78,8 +78,7 @@ Projected project(const ProjectInputs<double>& in, const RankTiles& ranks = {}) 
 TEST_CASE("the backward pass is the derivative of the splats") {
   World world;
   const Projected p = project(world.inputs());
-  const std::size_t P = p.sizes.splats, U = p.sizes.visible;
-  // The sum of the positions, depths, opacities and colours of all splats.
+  const size_t P = p.sizes.splats, U = p.sizes.visible;
   const auto sum_of = [](const Projected& splats) {
     double sum = 0;
     for (const auto* values : {&splats.means2d, &splats.depths, &splats.opacities, &splats.colors}) {
@@ -109,7 +108,7 @@ TEST_CASE("the backward pass is the derivative of the splats") {
     REQUIRE((above.sizes.splats == p.sizes.splats && below.sizes.splats == p.sizes.splats));
     return (sum_of(above) - sum_of(below)) / (2 * h);
   };
-  const std::size_t id = p.visible_ids[U / 3];
+  const size_t id = p.visible_ids[U / 3];
   REQUIRE(slope(&world.means[3 * id]) == Approx(v_means[3 * (U / 3)]).epsilon(1e-5).margin(1e-3));
   REQUIRE(slope(&world.scales[3 * id]) == Approx(v_scales[3 * (U / 3)]).epsilon(1e-5).margin(1e-3));
   REQUIRE(slope(&world.viewmats[3]) == Approx(v_viewmats[3]).epsilon(1e-4));

@@ -30,10 +30,8 @@
 //   v_conics      = -sum of g (dx^2 / 2, dx dy, dy^2 / 2)
 // g is 0 where min(0.99, .) clips; the order, the cut at 1/255 and the end of a pixel count as constants. The
 // caller computes the gradient of the background, the sum over pixels of v_renders * T. Splats in no list get
-// zeros. v_renders of unowned tiles are not read.
-//
-// With known_splats (common/kernel.h), gradients beyond that number are unspecified, and the backward pass
-// may be called with just these splats.
+// zeros. v_renders of unowned tiles are not read. With known_splats (common/kernel.h), gradients beyond that
+// number are unspecified, and the backward pass may be called with just these splats.
 //
 // The CPU gradient is bitwise repeatable for any number of threads: there is one partial sum per splat and
 // tile, and these are added in the order of the tiles. The CUDA gradient is repeatable if `deterministic` is
@@ -47,18 +45,18 @@ template <class T>
 struct RasterizeInput {
   const T *means2d, *conics, *opacities, *colors;
   const T* backgrounds;  // null: black
-  const std::int32_t* isect_splats;
-  const std::int64_t* tile_offsets;
-  std::int64_t n_splats;
+  const int32_t* isect_splats;
+  const int64_t* tile_offsets;
+  int64_t n_splats;
   int n_channels;
   TileGrid grid;
-  const std::int64_t* known_splats = nullptr;  // null: n_splats
+  const int64_t* known_splats = nullptr;  // null: n_splats
 };
 
 template <class T>
 struct RasterizeOutput {
   T *renders, *transmittances;
-  std::int32_t *last_ids, *tile_work;
+  int32_t *last_ids, *tile_work;
   T* splat_gradients;  // null, or [P] SplatGradient that forward sets to zero (CUDA, up to four channels)
   bool clear_rest;
 };
@@ -66,7 +64,7 @@ struct RasterizeOutput {
 template <class T>
 struct RasterizeSaved {
   const T* transmittances;
-  const std::int32_t* last_ids;
+  const int32_t* last_ids;
   const T* v_renders;
   const T* v_alphas;  // null: zero
 };
@@ -83,10 +81,10 @@ inline constexpr int kTileOrderClasses = 16;
 // Memory that forward fills for backward besides its outputs, in the layout of the backend. Backward may be
 // called with fewer splats than forward had capacity for, and for fewer tiles than forward composited.
 struct RasterizeAux {
-  void* packed;         // the packed splats, splats * rasterize_splat_bytes() bytes, 64-byte aligned
-  std::int64_t splats;  // the capacity of forward
-  std::int32_t* order;  // [1 + composited, kTileOrderClasses] of tile_order.cuh; null: tiles by their numbers
-  std::int64_t composited;  // the number of composited tiles
+  void* packed;        // the packed splats, splats * rasterize_splat_bytes() bytes, 64-byte aligned
+  int64_t splats;      // the capacity of forward
+  int32_t* order;      // [1 + composited, kTileOrderClasses] of tile_order.cuh; null: tiles by their numbers
+  int64_t composited;  // the number of composited tiles
 };
 
 // Which splats each pixel composites. Compositing is as above, without colours, so alpha and T of
@@ -109,28 +107,28 @@ struct RasterizeAux {
 // strongest so far.
 template <class T>
 struct PixelSplats {
-  const std::int32_t* slots;  // null: a row for each pixel
-  std::int64_t rows;
+  const int32_t* slots;  // null: a row for each pixel
+  int64_t rows;
   int strongest;
   T* transmittances;
-  std::int32_t *counts, *medians, *ids;
+  int32_t *counts, *medians, *ids;
   T* weights;
 };
 
 namespace BLITZGS_BACKEND {
-std::int64_t rasterize_splat_bytes(int n_channels);
+int64_t rasterize_splat_bytes(int n_channels);
 // Whether forward leaves an order of the tiles that it composites.
 bool rasterize_orders_tiles(const TileGrid& grid);
 template <class T>
 void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, const RasterizeAux& aux,
                    Workspace&, CudaStream);
 template <class T>
-void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, std::int64_t n_isects,
+void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, int64_t n_isects,
                    const RasterizeAux& aux, bool deterministic, const RasterizeGradients<T>& gradients,
                    Workspace&, CudaStream);
 // (CUDA) rasterize_bwd that adds the gradients to the table `packed` [P] of SplatGradient.
 void rasterize_bwd_packed(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
-                          std::int64_t n_isects, const RasterizeAux& aux, bool deterministic, bool absolute,
+                          int64_t n_isects, const RasterizeAux& aux, bool deterministic, bool absolute,
                           float* packed, Workspace&, CudaStream);
 template <class T>
 void pixel_splats(const RasterizeInput<T>& in, const PixelSplats<T>& out, Workspace&, CudaStream);
@@ -143,17 +141,16 @@ constexpr float kMedianTransmittance = 0.5f;
 
 // The row of a pixel; negative: none.
 template <class T>
-BLITZGS_HD std::int64_t row_of(const PixelSplats<T>& out, std::int64_t pixel) {
+BLITZGS_HD int64_t row_of(const PixelSplats<T>& out, int64_t pixel) {
   if (!out.slots) return pixel;
-  const std::int64_t slot = out.slots[pixel];
+  const int64_t slot = out.slots[pixel];
   return slot < out.rows ? slot : -1;
 }
 
 // Adds a splat behind the first `count` of a pixel to its `most` > 0 strongest. Returns the weight that the
 // next splat must exceed to be one of them.
 template <class T>
-BLITZGS_HD T keep_strongest(std::int32_t* ids, T* weights, int most, std::int32_t count, std::int32_t id,
-                            T weight) {
+BLITZGS_HD T keep_strongest(int32_t* ids, T* weights, int most, int32_t count, int32_t id, T weight) {
   int end = count < most ? count : most;
   if (end == most) {
     int weakest = 0;

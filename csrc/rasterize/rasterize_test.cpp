@@ -19,10 +19,10 @@ struct Scene {
   std::vector<T> means2d{T(20.5), T(10.5), T(12), T(8)};
   std::vector<T> conics{T(0.02), T(0.005), T(0.03), T(0.25), T(0), T(0.25)};
   std::vector<T> opacities{T(0.8), T(0.5)}, depths{T(2), T(1)}, colors{T(1), T(0.5), T(0), T(0), T(0), T(1)};
-  std::vector<std::int32_t> cameras{0, 0}, splats;
-  std::vector<std::int64_t> offsets = std::vector<std::int64_t>(7);
+  std::vector<int32_t> cameras{0, 0}, splats;
+  std::vector<int64_t> offsets = std::vector<int64_t>(7);
   std::vector<T> renders = std::vector<T>(2400), rest = std::vector<T>(800);
-  std::vector<std::int32_t> last = std::vector<std::int32_t>(800), work = std::vector<std::int32_t>(6);
+  std::vector<int32_t> last = std::vector<int32_t>(800), work = std::vector<int32_t>(6);
   TestWorkspace workspace;
 
   void intersect_splats() {
@@ -30,7 +30,7 @@ struct Scene {
         means2d.data(), conics.data(), opacities.data(), depths.data(), cameras.data(), nullptr, 2, grid};
     splats.resize(cpu::count_intersections(in, workspace, nullptr));
     REQUIRE(cpu::intersect(in, splats.size(), splats.data(), offsets.data(), workspace, nullptr) ==
-            static_cast<std::int64_t>(splats.size()));
+            int64_t(splats.size()));
   }
 
   RasterizeInput<T> input() const {
@@ -46,7 +46,6 @@ struct Scene {
             grid};
   }
 
-  // The sum of all colours of the image.
   double render() {
     cpu::rasterize_fwd(input(), {renders.data(), rest.data(), last.data(), work.data()}, {}, workspace,
                        nullptr);
@@ -58,27 +57,6 @@ struct Scene {
 
 }  // namespace
 
-// The near splat reaches 6.2 px around (12, 8): the first two tiles of the upper row.
-TEST_CASE("intersection lists splats front to back") {
-  Scene<float> scene;
-  scene.intersect_splats();
-  REQUIRE(scene.offsets == std::vector<std::int64_t>{0, 2, 4, 5, 6, 7, 8});
-  REQUIRE(scene.splats == std::vector<std::int32_t>{1, 0, 1, 0, 0, 0, 0, 0});
-}
-
-TEST_CASE("a pixel composites front to back") {
-  Scene<double> scene;
-  scene.intersect_splats();
-  scene.render();
-  const int pixel = 8 * 40 + 13;  // centre (13.5, 8.5)
-  const double front = 0.5 * std::exp(-0.5 * 0.25 * (1.5 * 1.5 + 0.5 * 0.5));
-  const double back = 0.8 * std::exp(-0.5 * (0.02 * 49 + 2 * 0.005 * 7 * 2 + 0.03 * 4));
-  REQUIRE(scene.renders[3 * pixel] == Approx(back * (1 - front)).epsilon(1e-12));
-  REQUIRE(scene.renders[3 * pixel + 2] == Approx(front).epsilon(1e-12));
-  REQUIRE(scene.rest[pixel] == Approx((1 - front) * (1 - back)).epsilon(1e-12));
-  REQUIRE(scene.last[pixel] == 2);
-}
-
 TEST_CASE("the gradient predicts a small step") {
   Scene<double> scene;
   scene.intersect_splats();
@@ -87,7 +65,7 @@ TEST_CASE("the gradient predicts a small step") {
   std::vector<double> v_means(4), v_conics(6), v_opacities(2), v_colors(6), v_abs(4);
   cpu::rasterize_bwd<double>(
       scene.input(), {scene.rest.data(), scene.last.data(), ones.data(), nullptr},
-      static_cast<std::int64_t>(scene.splats.size()), {}, true,
+      int64_t(scene.splats.size()), {}, true,
       {v_means.data(), v_conics.data(), v_opacities.data(), v_colors.data(), v_abs.data()}, scene.workspace,
       nullptr);
   const auto slope = [&scene](double& value) {
@@ -110,8 +88,8 @@ TEST_CASE("the gradient predicts a small step") {
 TEST_CASE("each pixel's splats and each splat's pixels are the same pairs") {
   Scene<float> scene;
   scene.intersect_splats();
-  std::vector<std::int64_t> weights(2), squares(2);
-  std::vector<std::int32_t> pixels(2), counts(800), medians(800), ids(800);
+  std::vector<int64_t> weights(2), squares(2);
+  std::vector<int32_t> pixels(2), counts(800), medians(800), ids(800);
   std::vector<float> strongest(800);
   cpu::contributions(scene.input(), {weights.data(), pixels.data(), squares.data()}, scene.workspace,
                      nullptr);

@@ -36,9 +36,9 @@ struct PlaneLayout {
 };
 
 // The scratch numbers of a tile: two planes, one plane per channel, and a row of pixel centres.
-inline std::size_t tile_memory(int tile_size, int n_channels) {
+inline size_t tile_memory(int tile_size, int n_channels) {
   const PlaneLayout layout(tile_size);
-  return static_cast<std::size_t>(layout.plane) * (2 + n_channels) + layout.stride;
+  return size_t(layout.plane) * (2 + n_channels) + layout.stride;
 }
 
 template <class T>
@@ -46,16 +46,16 @@ struct TileJob {
   const PreparedSplat<T>* splats;
   const T* colors;      // [P, D], for more than kPackedChannels channels
   const T* background;  // [D] or null
-  const std::int32_t* list;
-  std::int32_t n_entries;
+  const int32_t* list;
+  int32_t n_entries;
   int n_channels, tile_size;
   int x0, y0, width, height;  // the tile's pixels within the image
   int image_width;
-  std::int64_t first_pixel;   // index of (x0, y0) in [B, H, W]
-  RasterizeOutput<T> out;     // forward
-  RasterizeSaved<T> saved;    // backward
-  T* memory;                  // tile_memory() numbers
-  std::int32_t* last_memory;  // PlaneLayout::plane numbers
+  int64_t first_pixel;      // index of (x0, y0) in [B, H, W]
+  RasterizeOutput<T> out;   // forward
+  RasterizeSaved<T> saved;  // backward
+  T* memory;                // tile_memory() numbers
+  int32_t* last_memory;     // PlaneLayout::plane numbers
 };
 
 // The layout of one splat's partial gradient from one tile: these six numbers, then D colours, then, with
@@ -65,7 +65,7 @@ constexpr int partial_width(int n_channels, bool absgrad) { return kColor + n_ch
 
 template <class T>
 struct TileKernels {
-  std::int32_t (*forward)(const TileJob<T>&);                      // returns the entries processed
+  int32_t (*forward)(const TileJob<T>&);                           // returns the entries processed
   void (*backward)(const TileJob<T>&, T* partials);                // writes n_entries partial gradients
   void (*contribute)(const TileJob<T>&, const ContributionSums&);  // adds to the sums of all tiles
   void (*list_splats)(const TileJob<T>&, const PixelSplats<T>&);   // writes the rows of the tile's pixels
@@ -92,24 +92,24 @@ struct RowSpans {
   alignas(32) T dy[kMaxTileSize];
   alignas(32) T shift[kMaxTileSize];
   alignas(32) T minus_w2[kMaxTileSize];
-  alignas(32) std::int32_t first[kMaxTileSize];
-  alignas(32) std::int32_t last[kMaxTileSize];
+  alignas(32) int32_t first[kMaxTileSize];
+  alignas(32) int32_t last[kMaxTileSize];
 };
 
 // Fills spans and returns the rows that the splat may touch, one bit each.
 template <class Lanes, class T>
-std::uint64_t find_spans(const PreparedSplat<T>& splat, const TileJob<T>& tile, RowSpans<T>& spans) {
-  const T top = static_cast<T>(tile.y0) + T(0.5);
+uint64_t find_spans(const PreparedSplat<T>& splat, const TileJob<T>& tile, RowSpans<T>& spans) {
+  const T top = T(tile.y0) + T(0.5);
   const T low = splat.y - splat.half_height - top, high = splat.y + splat.half_height - top;
-  const T bottom = static_cast<T>(tile.height - 1);
-  const int row_begin = low > T(0) ? static_cast<int>(low < bottom ? low : bottom) / kLanes * kLanes : 0;
-  const int row_end = high >= T(0) ? static_cast<int>(high < bottom ? high : bottom) + 1 : 0;
+  const T bottom = T(tile.height - 1);
+  const int row_begin = low > T(0) ? int(low < bottom ? low : bottom) / kLanes * kLanes : 0;
+  const int row_end = high >= T(0) ? int(high < bottom ? high : bottom) + 1 : 0;
   const Lanes cut = Lanes::broadcast(splat.cut), zero = Lanes::zero();
-  const Lanes right = Lanes::broadcast(static_cast<T>(tile.width - 1));
-  const Lanes middle = Lanes::broadcast(splat.x - (static_cast<T>(tile.x0) + T(0.5)));
-  std::uint64_t rows = 0;
+  const Lanes right = Lanes::broadcast(T(tile.width - 1));
+  const Lanes middle = Lanes::broadcast(splat.x - (T(tile.x0) + T(0.5)));
+  uint64_t rows = 0;
   for (int row = row_begin; row < row_end; row += kLanes) {
-    const Lanes dy = Lanes::broadcast(top + static_cast<T>(row)) + Lanes::iota() - Lanes::broadcast(splat.y);
+    const Lanes dy = Lanes::broadcast(top + T(row)) + Lanes::iota() - Lanes::broadcast(splat.y);
     const Lanes w = Lanes::broadcast(splat.l22) * dy;
     const Lanes w2 = w * w;
     const Lanes rest = cut - w2;
@@ -124,7 +124,7 @@ std::uint64_t find_spans(const PreparedSplat<T>& splat, const TileJob<T>& tile, 
     first.to_int().store(spans.first + row);
     last.to_int().store(spans.last + row);
     const auto reached = Lanes::greater_equal(last, first) & Lanes::greater_equal(rest, zero);
-    rows |= static_cast<std::uint64_t>(reached.bits()) << row;
+    rows |= uint64_t(reached.bits()) << row;
   }
   return rows;
 }
@@ -137,20 +137,20 @@ int channels(const TileJob<T>& tile) {
 }
 
 template <int D, class T>
-const T* splat_color(const TileJob<T>& tile, std::int32_t index) {
+const T* splat_color(const TileJob<T>& tile, int32_t index) {
   if constexpr (D > 0 && D <= kPackedChannels) return tile.splats[index].color;
-  return tile.colors + static_cast<std::int64_t>(index) * channels<D>(tile);
+  return tile.colors + int64_t(index) * channels<D>(tile);
 }
 
 // The state of a tile's pixels in its memory: planes of zeros, and the pixel centres of a row.
 template <class State, class T>
 State start_planes(const TileJob<T>& tile, int n_channels) {
   const PlaneLayout layout(tile.tile_size);
-  const std::ptrdiff_t plane = layout.plane, used = plane * (2 + n_channels);
+  const ptrdiff_t plane = layout.plane, used = plane * (2 + n_channels);
   T* memory = tile.memory;
   std::fill_n(memory, used, T(0));
   std::fill_n(tile.last_memory, plane, 0);
-  for (int x = 0; x < layout.stride; ++x) memory[used + x] = static_cast<T>(tile.x0 + x) + T(0.5);
+  for (int x = 0; x < layout.stride; ++x) memory[used + x] = T(tile.x0 + x) + T(0.5);
   return {layout, memory, memory + plane, memory + 2 * plane, memory + used, tile.last_memory};
 }
 
@@ -158,9 +158,9 @@ template <class T>
 struct ForwardState {
   PlaneLayout layout;
   T *transmittance, *ended, *color, *centres;
-  std::int32_t* last;
-  std::uint64_t alive_rows = 0;
-  std::int32_t alive_in_row[kMaxTileSize] = {};
+  int32_t* last;
+  uint64_t alive_rows = 0;
+  int32_t alive_in_row[kMaxTileSize] = {};
 };
 
 template <int D, class T>
@@ -169,7 +169,7 @@ ForwardState<T> start_forward(const TileJob<T>& tile) {
   for (int row = 0; row < tile.height; ++row) {
     std::fill_n(state.transmittance + row * state.layout.stride, tile.width, T(1));
     state.alive_in_row[row] = tile.width;
-    state.alive_rows |= std::uint64_t{1} << row;
+    state.alive_rows |= uint64_t{1} << row;
   }
   return state;
 }
@@ -183,15 +183,15 @@ void end_pixels(ForwardState<T>& state, int row, int x, unsigned bits) {
     const int pixel = row * state.layout.stride + x + std::countr_zero(bits);
     state.ended[pixel] = state.transmittance[pixel];
     state.transmittance[pixel] = T(0);
-    if (--state.alive_in_row[row] == 0) state.alive_rows &= ~(std::uint64_t{1} << row);
+    if (--state.alive_in_row[row] == 0) state.alive_rows &= ~(uint64_t{1} << row);
   }
 }
 
 // Composites a splat at eight pixels of a row and gives the sink their weights alpha T, zero for pixels at
 // which the splat is not composited.
 template <class Lanes, class T, class Sink>
-inline void composite(const PreparedSplat<T>& splat, const RowSpans<T>& spans, std::int32_t entry, int row,
-                      int x, ForwardState<T>& state, Sink& sink) {
+inline void composite(const PreparedSplat<T>& splat, const RowSpans<T>& spans, int32_t entry, int row, int x,
+                      ForwardState<T>& state, Sink& sink) {
   const int pixel = row * state.layout.stride + x;
   const Lanes before = Lanes::load(state.transmittance + pixel);
   const auto running = Lanes::greater(before, Lanes::zero());
@@ -205,7 +205,7 @@ inline void composite(const PreparedSplat<T>& splat, const RowSpans<T>& spans, s
   const auto drawn = touched & Lanes::greater_equal(after, Lanes::broadcast(T(kMinTransmittance)));
   sink.add(Lanes::keep(drawn, alpha * before), pixel);
   Lanes::select(drawn, after, before).store(state.transmittance + pixel);
-  std::int32_t* last = state.last + pixel;
+  int32_t* last = state.last + pixel;
   Lanes::Int::select(drawn, Lanes::Int::broadcast(entry + 1), Lanes::Int::load(last)).store(last);
   const auto ending = touched.and_not(drawn);
   if (ending.any()) end_pixels(state, row, x, ending.bits());
@@ -216,7 +216,7 @@ void write_pixels(const TileJob<T>& tile, const ForwardState<T>& state) {
   for (int row = 0; row < tile.height; ++row) {
     for (int x = 0; x < tile.width; ++x) {
       const int pixel = row * state.layout.stride + x;
-      const std::int64_t out = tile.first_pixel + static_cast<std::int64_t>(row) * tile.image_width + x;
+      const int64_t out = tile.first_pixel + int64_t(row) * tile.image_width + x;
       const T running = state.transmittance[pixel];
       const T rest = running > T(0) ? running : state.ended[pixel];
       tile.out.transmittances[out] = rest;
@@ -232,21 +232,21 @@ void write_pixels(const TileJob<T>& tile, const ForwardState<T>& state) {
 
 // The hardware cannot predict which splats a list names, so the loops prefetch splats this many entries
 // ahead. Both loops contain the prefetch itself, because gcc drops calls of a function that only prefetches.
-constexpr std::int32_t kPrefetchDistance = 6;
+constexpr int32_t kPrefetchDistance = 6;
 
 // Composites the tile's list and returns the number of entries processed. For each entry it calls
 // sink.begin(splat), then sink.add(alpha T of eight pixels, the first of these pixels) for the pixels that
 // the splat may touch, then sink.end(splat).
 template <class Lanes, class T, class Sink>
-std::int32_t composite_list(const TileJob<T>& tile, ForwardState<T>& state, Sink& sink) {
+int32_t composite_list(const TileJob<T>& tile, ForwardState<T>& state, Sink& sink) {
   RowSpans<T> spans;
-  std::int32_t entry = 0;
+  int32_t entry = 0;
   for (; entry < tile.n_entries && state.alive_rows; ++entry) {
     __builtin_prefetch(tile.splats + tile.list[std::min(entry + kPrefetchDistance, tile.n_entries - 1)]);
-    const std::int32_t index = tile.list[entry];
+    const int32_t index = tile.list[entry];
     const PreparedSplat<T>& splat = tile.splats[index];
     sink.begin(index);
-    std::uint64_t rows = find_spans<Lanes>(splat, tile, spans) & state.alive_rows;
+    uint64_t rows = find_spans<Lanes>(splat, tile, spans) & state.alive_rows;
     for (; rows; rows &= rows - 1) {
       const int row = std::countr_zero(rows);
       for (int x = spans.first[row]; x <= spans.last[row]; x += kLanes) {
@@ -263,26 +263,26 @@ template <class Lanes, int D, class T>
 struct ColorSink {
   const TileJob<T>& tile;
   T* planes;
-  std::ptrdiff_t plane;
+  ptrdiff_t plane;
   const T* color = nullptr;
 
-  void begin(std::int32_t index) { color = splat_color<D>(tile, index); }
+  void begin(int32_t index) { color = splat_color<D>(tile, index); }
   void add(Lanes share, int pixel) const {
     for (int c = 0; c < channels<D>(tile); ++c) {
       T* sum = planes + c * plane + pixel;
       Lanes::fma(share, Lanes::broadcast(color[c]), Lanes::load(sum)).store(sum);
     }
   }
-  void end(std::int32_t) const {}
+  void end(int32_t) const {}
 };
 
 // Composites one tile of the image and writes its pixels. Returns the number of entries processed.
 template <class Lanes, int D>
-std::int32_t forward_tile(const TileJob<typename Lanes::Scalar>& tile) {
+int32_t forward_tile(const TileJob<typename Lanes::Scalar>& tile) {
   using T = typename Lanes::Scalar;
   ForwardState<T> state = start_forward<D>(tile);
   ColorSink<Lanes, D, T> sink{tile, state.color, state.layout.plane};
-  const std::int32_t entries = composite_list<Lanes>(tile, state, sink);
+  const int32_t entries = composite_list<Lanes>(tile, state, sink);
   write_pixels<D>(tile, state);
   return entries;
 }
@@ -292,21 +292,21 @@ std::int32_t forward_tile(const TileJob<typename Lanes::Scalar>& tile) {
 template <class Lanes, class T>
 struct ContributionSink {
   const ContributionSums& sums;
-  std::int64_t weight = 0, squares = 0;
-  std::int32_t pixels = 0;
+  int64_t weight = 0, squares = 0;
+  int32_t pixels = 0;
 
-  void begin(std::int32_t) { weight = squares = pixels = 0; }
+  void begin(int32_t) { weight = squares = pixels = 0; }
   void add(Lanes share, int) {
     alignas(64) T shares[kLanes];
     share.store(shares);
     for (const T alpha_t : shares) {
-      const auto units = static_cast<std::uint64_t>(std::llrint(alpha_t * T(kContributionScale)));
-      weight += static_cast<std::int64_t>(units);
-      if (sums.squares) squares += static_cast<std::int64_t>(units * units >> 32);
+      const auto units = uint64_t(std::llrint(alpha_t * T(kContributionScale)));
+      weight += int64_t(units);
+      if (sums.squares) squares += int64_t(units * units >> 32);
       pixels += alpha_t > T(0);
     }
   }
-  void end(std::int32_t index) const {
+  void end(int32_t index) const {
     if (pixels == 0) return;
     std::atomic_ref(sums.weights[index]).fetch_add(weight, std::memory_order_relaxed);
     std::atomic_ref(sums.pixels[index]).fetch_add(pixels, std::memory_order_relaxed);
@@ -314,7 +314,6 @@ struct ContributionSink {
   }
 };
 
-// Composites one tile without colours and adds the contributions of its splats to `sums` (importance.h).
 template <class Lanes>
 void contribute_tile(const TileJob<typename Lanes::Scalar>& tile, const ContributionSums& sums) {
   using T = typename Lanes::Scalar;
@@ -323,37 +322,34 @@ void contribute_tile(const TileJob<typename Lanes::Scalar>& tile, const Contribu
   composite_list<Lanes>(tile, state, sink);
 }
 
-// Writes the splats of the pixels (rasterize.h).
 template <class Lanes, class T>
 struct PixelSink {
   const TileJob<T>& tile;
   const ForwardState<T>& state;
   const PixelSplats<T>& out;
-  std::int32_t id = 0;
+  int32_t id = 0;
 
-  void begin(std::int32_t index) { id = index; }
+  void begin(int32_t index) { id = index; }
   void add(Lanes share, int pixel) const {
     alignas(64) T shares[kLanes];
     share.store(shares);
     const int y = pixel / state.layout.stride, x = pixel % state.layout.stride;
     for (int i = 0; i < kLanes; ++i) {
       if (!(shares[i] > T(0))) continue;
-      const std::int64_t row =
-          row_of(out, tile.first_pixel + static_cast<std::int64_t>(y) * tile.image_width + x + i);
+      const int64_t row = row_of(out, tile.first_pixel + int64_t(y) * tile.image_width + x + i);
       if (row < 0) continue;
       // The transmittance is still that in front of the splat.
       if (state.transmittance[pixel + i] > T(kMedianTransmittance)) out.medians[row] = id;
-      const std::int32_t count = out.counts[row]++;
+      const int32_t count = out.counts[row]++;
       if (out.strongest > 0) {
-        const std::int64_t first = row * out.strongest;
+        const int64_t first = row * out.strongest;
         keep_strongest(out.ids + first, out.weights + first, out.strongest, count, id, shares[i]);
       }
     }
   }
-  void end(std::int32_t) const {}
+  void end(int32_t) const {}
 };
 
-// Composites one tile without colours and writes the splats of its pixels.
 template <class Lanes>
 void list_tile_splats(const TileJob<typename Lanes::Scalar>& tile,
                       const PixelSplats<typename Lanes::Scalar>& out) {
@@ -362,22 +358,21 @@ void list_tile_splats(const TileJob<typename Lanes::Scalar>& tile,
   const auto for_rows = [&](auto&& write) {
     for (int y = 0; y < tile.height; ++y) {
       for (int x = 0; x < tile.width; ++x) {
-        const std::int64_t row =
-            row_of(out, tile.first_pixel + static_cast<std::int64_t>(y) * tile.image_width + x);
+        const int64_t row = row_of(out, tile.first_pixel + int64_t(y) * tile.image_width + x);
         if (row >= 0) write(row, y * state.layout.stride + x);
       }
     }
   };
-  for_rows([&](std::int64_t row, int) {
+  for_rows([&](int64_t row, int) {
     out.counts[row] = 0;
     out.medians[row] = -1;
   });
   PixelSink<Lanes, T> sink{tile, state, out};
   composite_list<Lanes>(tile, state, sink);
-  for_rows([&](std::int64_t row, int pixel) {
+  for_rows([&](int64_t row, int pixel) {
     const T running = state.transmittance[pixel];
     out.transmittances[row] = running > T(0) ? running : state.ended[pixel];
-    for (std::int64_t k = out.counts[row]; k < out.strongest; ++k) {
+    for (int64_t k = out.counts[row]; k < out.strongest; ++k) {
       out.ids[row * out.strongest + k] = -1;
       out.weights[row * out.strongest + k] = T(0);
     }

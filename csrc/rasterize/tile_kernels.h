@@ -21,8 +21,8 @@ struct BackwardState {
   T* transmittance;  // in front of the entries visited so far
   T* behind;         // v_renders . (the colour of those entries and the background, as seen with T = 1)
   T *v_render, *centres;
-  std::int32_t* last;
-  std::int32_t last_in_row[kMaxTileSize] = {};
+  int32_t* last;
+  int32_t last_in_row[kMaxTileSize] = {};
 };
 
 template <int D, class T>
@@ -32,7 +32,7 @@ BackwardState<T> start_backward(const TileJob<T>& tile) {
   for (int row = 0; row < tile.height; ++row) {
     for (int x = 0; x < tile.width; ++x) {
       const int pixel = row * state.layout.stride + x;
-      const std::int64_t in = tile.first_pixel + static_cast<std::int64_t>(row) * tile.image_width + x;
+      const int64_t in = tile.first_pixel + int64_t(row) * tile.image_width + x;
       state.transmittance[pixel] = tile.saved.transmittances[in];
       state.last[pixel] = tile.saved.last_ids[in];
       state.last_in_row[row] = std::max(state.last_in_row[row], state.last[pixel]);
@@ -62,8 +62,8 @@ struct GradientSums {
 // Differentiates one entry at eight pixels of a row: adds to its sums and v_color, and updates the pixels.
 template <class Lanes, int D, bool kAbs, class T>
 inline void differentiate(const TileJob<T>& tile, const PreparedSplat<T>& splat, const T* splat_colors,
-                          const RowSpans<T>& spans, std::int32_t entry, int row, int x,
-                          BackwardState<T>& state, GradientSums<Lanes, kAbs>& sums, Lanes* v_color) {
+                          const RowSpans<T>& spans, int32_t entry, int row, int x, BackwardState<T>& state,
+                          GradientSums<Lanes, kAbs>& sums, Lanes* v_color) {
   const int pixel = row * state.layout.stride + x;
   const auto composited =
       Lanes::Int::greater(Lanes::Int::load(state.last + pixel), Lanes::Int::broadcast(entry));
@@ -133,7 +133,7 @@ void backward_tile(const TileJob<typename Lanes::Scalar>& tile, typename Lanes::
   RowSpans<T> spans;
   const int n_channels = channels<D>(tile), width = partial_width(n_channels, kAbs);
   std::vector<Lanes> many(D > 0 ? 0 : n_channels);
-  for (std::int32_t entry = tile.n_entries - 1; entry >= 0; --entry) {
+  for (int32_t entry = tile.n_entries - 1; entry >= 0; --entry) {
     __builtin_prefetch(tile.splats + tile.list[std::max(entry - kPrefetchDistance, 0)]);
     const PreparedSplat<T>& splat = tile.splats[tile.list[entry]];
     const T* color = splat_color<D>(tile, tile.list[entry]);
@@ -141,7 +141,7 @@ void backward_tile(const TileJob<typename Lanes::Scalar>& tile, typename Lanes::
     Lanes few[D > 0 ? D : 1];
     Lanes* v_color = D > 0 ? few : many.data();
     std::fill_n(v_color, n_channels, Lanes::zero());
-    std::uint64_t rows = find_spans<Lanes>(splat, tile, spans);
+    uint64_t rows = find_spans<Lanes>(splat, tile, spans);
     for (; rows; rows &= rows - 1) {
       const int row = std::countr_zero(rows);
       if (state.last_in_row[row] <= entry) continue;
@@ -149,7 +149,7 @@ void backward_tile(const TileJob<typename Lanes::Scalar>& tile, typename Lanes::
         differentiate<Lanes, D, kAbs>(tile, splat, color, spans, entry, row, x, state, sums, v_color);
       }
     }
-    write_partial(splat, sums, v_color, n_channels, partials + static_cast<std::int64_t>(entry) * width);
+    write_partial(splat, sums, v_color, n_channels, partials + int64_t(entry) * width);
   }
 }
 
