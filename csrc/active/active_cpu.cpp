@@ -90,9 +90,8 @@ void transpose_bits(uint32_t* words) {
   }
 }
 
-// Calls f(words, count, rows, sector) for each square of 32 rows and 32 columns. words: 32 words of scratch,
-// zero. count: the number of existing rows. rows: the word of the first row. sector: the word of the first
-// column.
+// Calls f(words, count, rows, sector) for each square of 32 rows and 32 columns. words: 32 zeros. count: the
+// existing rows. rows, sector: the words of the first row and the first column.
 template <class F>
 void for_each_square(const CullMask& mask, const F& f) {
   parallel_rows(blocks_of(mask.n) * kSectorWords, 64, [&](int64_t group) {

@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The active set of a step: the rows of the table that some view may see, found without reading most of the
-// others.
+// The active set of a step: the rows of the table that some view may see, without reading most others.
 //
 // The table is in Morton order, so consecutive rows are neighbours in space. A block is 256 consecutive rows.
 // Its bounds contain every position and size that its Gaussians can have while steps of the lazy optimiser
@@ -17,10 +16,9 @@
 // A gate on the views (view_gate.h) drops rows by the same principle, by the distances of a box from the
 // camera. A row for which they do not decide stays active; the exact test follows when the row has caught up.
 //
-// The test is conservative: every row that the projection would project is in the set. The cost is O(N / 256
-// + rows of mixed blocks + active rows) per view, the memory O(rows of the blocks that some view may see).
-// The caller gives the capacity in blocks. If more are active, the lists are empty and n_blocks says how
-// many.
+// The test is conservative: every row that the projection would project is in the set. The cost is
+// O(N / 256 + rows of mixed blocks + active rows) per view, the memory O(rows of the blocks that some view
+// may see). The caller gives a capacity in blocks. If more are active, the lists are empty; n_blocks says so.
 #pragma once
 #include <cfloat>
 
@@ -61,8 +59,7 @@ BLITZGS_HD float pending_drift(float m, float v, float tail) {
   return m == 0.0f || !(v > 0.0f) ? 0.0f : m / std::sqrt(v) * tail * 1.00001f;
 }
 
-// The box in which a row stays while its steps are pending. A row that is not finite is never visible and has
-// an empty box.
+// The box in which a row stays while its steps are pending. That of a row that is not finite is empty.
 BLITZGS_HD SweptBox sweep_row(const BlockRows& rows, int64_t row) {
   SweptBox box = empty_box();
   // All values whose address depends on the row alone are loaded before the first computation, so that a GPU
@@ -282,8 +279,7 @@ struct alignas(16) ActiveBlock {
   BlockViews seen;
 };
 
-// The result of the tests, from which the rows are listed. The lists have a capacity of capacity_blocks
-// blocks.
+// The result of the tests, from which the rows are listed, for at most capacity_blocks blocks.
 struct CullPlan {
   ActiveBlock* blocks;  // the blocks that some view may see, in order
   uint32_t* masks;      // [blocks, kBlockRows], the views that may see each row of a mixed block, as bits

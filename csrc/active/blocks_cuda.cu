@@ -8,8 +8,7 @@ namespace blitzgs::cuda {
 namespace {
 
 constexpr int kWarps = kBlockRows / 32;
-// A group is this many blocks of the table, which a CUDA block tests with one thread each. Prefix sums over
-// active rows are kept by group.
+// A group: the blocks that a CUDA block tests with a thread each, by which prefix sums over rows are kept.
 constexpr int kGroup = kBlockRows;
 // The number of CUDA blocks with kBlockRows threads that fit a multiprocessor of every supported GPU.
 constexpr int kResident = 6;
@@ -26,8 +25,7 @@ __device__ void append(bool present, int32_t item, int32_t* list, int32_t* lengt
 }
 
 // Lists the blocks of the rows ids [n]. One thread per row; the thread of the first row of each block appends
-// the block. If the rows did not ascend, a block could be listed several times, which costs time but is
-// correct.
+// the block. If rows did not ascend, a block would be listed several times, which only costs time.
 __global__ void list_blocks(const int32_t* ids, int64_t n, int32_t* list, int32_t* length) {
   wait_for_earlier_kernels();
   const int64_t i = blockIdx.x * int64_t{blockDim.x} + threadIdx.x;
@@ -173,8 +171,7 @@ __device__ int32_t rows_before(const CullPlan& plan, const int32_t* groups, int3
   return __reduce_add_sync(kFullWarp, lane < kWarps ? parts[lane] : 0);
 }
 
-// The third kernel of cull_blocks: lists the active rows and their views, in order. One warp per block of the
-// plan.
+// The third kernel of cull_blocks: lists the active rows and their views, in order. A warp per block.
 __global__ void __launch_bounds__(kBlockRows)
     emit_rows(int64_t n, const CullPlan plan, const int32_t* groups, const ActiveList out) {
   wait_for_earlier_kernels();

@@ -62,8 +62,7 @@ struct CullMask {
 // level 0 at any distance, and a level beyond L_max(t) nowhere (reach < 0). Comparing squared distances
 // decides the same sets without a logarithm.
 //
-// Cull mask: view v drops row i iff the row's bit in column columns[v] of the cull matrix is set. The matrix
-// is stored by sector.
+// Cull mask: view v drops row i iff its bit in column columns[v] of the cull matrix, by sector, is set.
 //
 // The op clears the bits of dropped pairs in `views`, in place. The decision for a row depends on this row
 // alone, in float32 and from caught-up means, so the sets depend neither on the order of the rows nor on how
@@ -147,8 +146,7 @@ BLITZGS_HD void gate_entry(const ViewGateArgs& args, const GateTable& table, int
   if (kept != seen) args.views[i] = int32_t(kept);
 }
 
-// Fills `table` with the table of the rules and the camera centres. All threads of a block call this, each
-// for one level and one view.
+// Fills `table` with the table of the rules and the camera centres. Each thread does a level and a view.
 BLITZGS_HD void fill_gate_table(const GateRules& rules, const float* viewmats, int thread, GateTable& table) {
   if (thread < kMaxLevels) table.reach2[thread] = rules.table.reach2[thread];
   if (thread < rules.n_views) {

@@ -14,8 +14,8 @@
 //   sum over j of mu_j rho_j^k = tail_k[P] - q_k^(s-P) tail_k[s],   k = 0 .. 3,
 // where the tails are tabulated once per schedule (see the table below).
 //
-// The rule is exact if eps is negligible against sqrt(v) (then only k = 0 counts) and if eps dominates (k =
-// 1). In between its relative error is largest near eps = 3 sqrt(v), and below half the square of rho's
+// The rule is exact if eps is negligible against sqrt(v) (then only k = 0 counts) and if eps dominates
+// (k = 1). In between its relative error is largest near eps = 3 sqrt(v), and below half the square of rho's
 // relative variance: 1e-9 of the drift in the middle of a schedule, and below the rounding of float32 after
 // some 200 steps of one view. Where this is not exact enough (earlier, and in float64), the elements for
 // which eps matters take the pending steps one by one, at most `explicit_steps` of them: q_0^j is below the
@@ -67,8 +67,7 @@ struct alignas(4 * sizeof(T)) AdamRule {
   T place[2], weight[2];
 };
 
-// The pending steps of rows whose parameters are at step `from` and catch up to step `to`: the rules of the
-// drift.
+// The rules of the drift of rows whose parameters are at step `from` and catch up to step `to`.
 template <class T>
 struct PendingSteps {
   AdamRule<T> rules[kAdamGroups];
@@ -184,8 +183,7 @@ struct FinalRules {
   }
 };
 
-// The drift of one element by its pending steps, one by one; m and root = sqrt(v) are those at step
-// steps.from.
+// The drift of one element by its pending steps, one by one; m and root = sqrt(v) at steps.from.
 template <class T>
 BLITZGS_HD T adam_explicit_drift(const AdamArgs<T>& args, const PendingSteps<T>& steps, int group, T m,
                                  T root) {
@@ -297,9 +295,8 @@ BLITZGS_HD void enter_rate(const RatesArgs& args, int32_t back, int order, doubl
 }
 
 namespace BLITZGS_BACKEND {
-// With gradients: the listed rows catch up to step - 1 and take the step `step`; their parameters and moments
-// are then at `step`. Without gradients (column.grad null): the parameters of the listed rows catch up to
-// `step`.
+// With gradients: the listed rows catch up to step - 1 and take the step `step`; parameters and moments are
+// then at `step`. Without (column.grad null), their parameters catch up to `step`.
 template <class T>
 void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream);
 }  // namespace BLITZGS_BACKEND

@@ -14,8 +14,7 @@ AdamRowUpdate<T> row_update() {
   return update_row<T>;
 }
 
-// The rows of a list are scattered in memory, so a row's state is prefetched while the rows before it are
-// updated.
+// The rows of a list are scattered in memory, so a row is prefetched while those before are updated.
 constexpr int64_t kPrefetchDistance = 3;
 
 template <class T>

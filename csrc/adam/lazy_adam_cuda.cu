@@ -9,15 +9,13 @@ namespace {
 
 // The lazy optimiser (lazy_adam.h) on CUDA. Catching up takes three kernels: prepare computes the rules and
 // list_pending_rows lists the rows with pending steps (lazy_adam_device.cuh), and catch_up_kernel moves their
-// parameters. step_kernel then takes the step with gradients. A parameter that is stepped alone has kernels
-// of its own.
+// parameters. step_kernel takes the step with gradients. A parameter stepped alone has its own.
 
 // A row with SH degree 3 has 12 packs of four SH coefficients, one quaternion and seven more numbers; each of
 // these gets a thread.
 constexpr int kRows = 16;  // rows per block
 constexpr int kThreads = kRows * (12 + 8);
-// With three SH values a row (the first coefficient, stepped without the others) a block has threads for more
-// rows.
+// With three SH values a row (the first coefficient alone) a block has threads for more rows.
 constexpr int kFewPacks = 3, kMoreRows = kThreads / (kFewPacks + 8);
 constexpr int kCatchUpBlocks = 4, kListBlocks = 8;  // per multiprocessor
 constexpr int kAlone = kAdamColumns - 1;            // the column of a parameter that is stepped alone

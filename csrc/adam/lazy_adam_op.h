@@ -10,8 +10,7 @@ namespace blitzgs {
 
 inline constexpr const char* kAdamNames[kAdamColumns] = {"means", "quats", "scales", "opacities", "sh"};
 
-// The number of tensors in a state: parameters, first and second moments of each column; last_step,
-// moment_step.
+// The tensors of a state: each column's parameter, first and second moment; last_step, moment_step.
 inline constexpr size_t kAdamState = 3 * kAdamColumns + 2, kAloneState = 3 + 2;
 
 struct AdamConstants {
@@ -66,8 +65,7 @@ struct AdamTensors {
     return checked("ids", *ids, is_long ? ScalarType::Long : ScalarType::Int, {-1});
   }
 
-  // The kernel's arguments for the rows of a list (`checked_rows`). Gradients are null; the caller sets
-  // them.
+  // The kernel's arguments for the rows of a list (`checked_rows`). The caller sets gradients.
   template <class T>
   AdamArgs<T> arguments(const OptionalTensor& ids) {
     AdamArgs<T> args{};

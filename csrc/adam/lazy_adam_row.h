@@ -1,14 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 // The update of one row on the CPU. The file is compiled twice, for the baseline and for AVX2. Both compile
-// the same element-wise loops, so they give the same bits. Everything here has internal linkage, so that the
-// linker cannot mix the two.
+// the same element-wise loops, so they give the same bits. Internal linkage keeps the two apart.
 #pragma once
 #include "adam/lazy_adam.h"
 
 namespace blitzgs::cpu {
 
-// The function for elements that take their pending steps one by one. They are rare, so plain code handles
-// them.
+// The function for elements that take their pending steps one by one. They are rare: it is plain code.
 template <class T>
 using ExplicitDrift = T (*)(const AdamArgs<T>& args, const PendingSteps<T>& steps, int group, T m, T root);
 

@@ -13,8 +13,7 @@ extern "C" {
 // Returns the version of CUDA and the GPUs (cmake/cuda.cmake).
 __attribute__((visibility("default"))) const char* blitzgs_cuda_build() { return BLITZGS_CUDA_BUILD; }
 
-// Returns 1 if the code that the current device runs has the branches for sm_90, otherwise 0; -1 without a
-// device.
+// Returns whether the code that the current device runs has the branches for sm_90; -1 without a device.
 __attribute__((visibility("default"))) int blitzgs_sm90_branches() {
   int answer = -1;
   return cudaMemcpyFromSymbol(&answer, sm90_branches, sizeof(answer)) == cudaSuccess ? answer : -1;

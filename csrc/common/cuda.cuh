@@ -56,8 +56,7 @@ inline int multiprocessors() {
   return count;
 }
 
-// The number of blocks for n items of a kernel that loops over them: at most `resident` for each
-// multiprocessor.
+// The number of blocks for n items of a kernel that loops over them: at most `resident` a multiprocessor.
 inline unsigned resident_blocks(int64_t n, int threads, int resident) {
   return unsigned(std::min((n + threads - 1) / threads, int64_t{resident} * multiprocessors()));
 }
@@ -89,15 +88,15 @@ __device__ __forceinline__ int64_t atomic_add(int64_t* sum, int64_t amount) {
 // the kernel before it have ended, while that kernel's memory is still being flushed. The rules:
 //
 // - Each block calls wait_for_earlier_kernels() before its first access to global memory, reads and writes
-// alike, and before any return: an earlier kernel may still read what this one would overwrite.
+//   alike, and before any return: an earlier kernel may still read what this one would overwrite.
 // - The call returns when the kernel before it has ended and its writes are visible. That one waited itself,
-// or was launched plainly and so began after all earlier kernels had ended. Hence all earlier kernels have
-// ended, and memory that the allocator reuses in stream order is safe.
+//   or was launched plainly and so began after all earlier kernels had ended. Hence all earlier kernels have
+//   ended, and memory that the allocator reuses in stream order is safe.
 // - Plain launches, copies, events and kernels of other libraries wait until the kernel before them has
-// ended.
+//   ended.
 // - No kernel lets the next one in before its own blocks end (griddepcontrol.launch_dependents): a waiting
-// block occupies a multiprocessor, which a kernel that spins for another GPU may need, and spreads the blocks
-// of the next kernel unevenly (docs/decisions.md).
+//   block occupies a multiprocessor, which a kernel that spins for another GPU may need, and spreads the
+//   blocks of the next kernel unevenly (docs/decisions.md).
 
 __device__ __forceinline__ void wait_for_earlier_kernels() {
 #if BLITZGS_SM90
@@ -214,8 +213,7 @@ __device__ double block_sum(double value) {
 
 // The memory of a prefix sum over the blocks of a launch while they run: a counter from which blocks take
 // numbers, and a state for each number. The two high bits of a state say what the rest is: the own sum of
-// that number, or what the sum's class says. Kind and sum are in one word, so no fence is needed to order
-// them. Sums are in [0, 2^62).
+// that number, or what the sum's class says. In one word, they need no fence. Sums are in [0, 2^62).
 class SumStates {
  public:
   // zeros: one word for each number and one more, all zero.
@@ -322,8 +320,7 @@ class TurnSums : public SumStates {
     return value(state);
   }
 
-  // Adds up the sums of turns [0, n) as blocks publish them; called by one warp. Blocks must take all n
-  // turns.
+  // Adds up the sums of turns [0, n) as blocks publish them; called by one warp; blocks take all of them.
   __device__ void add_up(int n) const {
     constexpr int kEach = 4;  // turns that a lane reads at a time
     const int lane = threadIdx.x % 32;

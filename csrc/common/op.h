@@ -26,8 +26,7 @@
 #define BLITZGS_ON_CUDA false
 #endif
 
-// STABLE_TORCH_LIBRARY_IMPL pastes its key, so the macro of the key is expanded first. One BLITZGS_REGISTER a
-// file.
+// STABLE_TORCH_LIBRARY_IMPL pastes its key, so the macro of the key is expanded first. One a file.
 #define BLITZGS_REGISTER_EXPANDED(key, m) STABLE_TORCH_LIBRARY_IMPL(blitzgs, key, m)
 #define BLITZGS_REGISTER(m) BLITZGS_REGISTER_EXPANDED(BLITZGS_DISPATCH_KEY, m)
 #define BLITZGS_OP(m, name, function) m.impl(name, ::blitzgs::named_op<name, TORCH_BOX(&::blitzgs::function)>)
@@ -75,8 +74,7 @@ template <typename... Parts>
   throw CheckFailed(text.str());
 }
 
-// Throws the message unless a condition holds. Unlike STD_TORCH_CHECK, without the path of the source file,
-// which says nothing to a user.
+// Throws the message unless a condition holds. Unlike STD_TORCH_CHECK, without the path of the source.
 #define BLITZGS_CHECK(condition, ...) \
   do {                                \
     if (!(condition)) [[unlikely]]    \
@@ -248,8 +246,7 @@ Values<T> make(const Tensor& like, const IntList& shape) {
   return Values<T>(make_empty(like, shape, dtype_of<T>::value));
 }
 
-// A tensor in the memory of another one, `offset` elements after its begin. Autograd does not see that it is
-// a view.
+// A tensor in the memory of another one, `offset` elements after its begin. Autograd sees no view.
 inline Tensor view_of(const Tensor& tensor, const IntList& shape, const IntList& strides, int64_t offset) {
   AtenTensorHandle handle = nullptr;
   // Despite the name of its parameter, torch adds the offset to that of the tensor.
@@ -259,8 +256,7 @@ inline Tensor view_of(const Tensor& tensor, const IntList& shape, const IntList&
 }
 
 // An upper bound on the number of valid entries of a list of `capacity`, of which the first count [1] are
-// valid (absent: all). On CUDA it is the capacity: the kernels read the count, and the host does not wait for
-// it.
+// valid (absent: all). On CUDA it is the capacity: kernels alone read the count.
 inline int64_t max_listed(const OptionalTensor& count, int64_t capacity) {
   if (!count) return capacity;
   check_dtype("the count of a list", *count, ScalarType::Int);
@@ -285,8 +281,7 @@ class TorchWorkspace final : public Workspace {
   TensorList held_;
 };
 
-// Makes the tensor's device current and finds its stream (CUDA); kernels take (..., scope.workspace,
-// scope.stream).
+// Makes the device of the tensor current and finds its stream (CUDA), and lends scratch memory.
 struct DeviceScope {
   explicit DeviceScope(const Tensor& like)
       : workspace(like)

@@ -76,8 +76,7 @@ BLITZGS_FOR_BOTH_DTYPES(sum);
 
 namespace {
 
-// Number of neighbouring costs that are added up first. Only the stretches that contain a bound are then
-// searched tile by tile.
+// Number of neighbouring costs that are added up first. Only stretches with a bound are searched by tile.
 constexpr int64_t kStretch = 128;
 
 // Conversions between float and float16 of values >= 0. They use integer operations, which the compiler

@@ -96,8 +96,7 @@ struct SplatValues {
 #pragma unroll 4  // four loads at a time; the compiler would choose 16
 #endif
     for (int m = 0; m < n_ranks; ++m) ranks |= uint64_t{run[m].has(in_run)} << m;
-    // Most splats went to a single rank. With this loop the threads of a warp load their first values
-    // together.
+    // Most splats went to a single rank. So the threads of a warp load first values together.
     for (; ranks != 0; ranks &= ranks - 1) {
       const int m = lowest_bit(ranks);
       const int64_t at = run[m].of(in_run);

@@ -19,8 +19,7 @@ namespace blitzgs::cpu {
 void store_tile_costs(const float* costs, int64_t tiles, int64_t grain, uint16_t* pieces);
 
 // The views of a batch, of `tiles` tiles each. A view without pieces (null) has the mean cost of the views
-// `similar`, added up in their order in floats; without any, zeros. `tile_cost` is added to the cost of each
-// tile.
+// `similar`, added up in their order in floats; without any, zeros. `tile_cost` is added to each.
 struct BatchCosts {
   const uint16_t* const* views;
   int64_t n_views;

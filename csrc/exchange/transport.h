@@ -14,8 +14,7 @@
 // its writes are visible, before work that any rank queues after its barrier runs. Each rank also sends its
 // `values` to all others. control[m], int64: [M], the number of the last barrier that each rank reached; from
 // word `first` on [M, n], the values of each rank, then [n], their sums. host [M, n], in pinned memory,
-// receives the values for the host. A rank that waits for longer than timeout_seconds aborts its kernels, so
-// that its process gets an error.
+// receives the values for the host. A rank that waits for longer than timeout_seconds aborts with an error.
 #pragma once
 #include "exchange/scatter.h"
 #include "project/project.h"
@@ -58,8 +57,7 @@ void send_splats(const SendArguments&, CudaStream);
 
 // The address at which kernels of the current device access pinned memory of the host. Throws if the memory
 // is not pinned. Kernels write numbers for the host there themselves: a cudaMemcpyAsync would be done by
-// another engine of the GPU, and the stream would wait before and after it. The host may read them after it
-// has waited for the kernel.
+// another engine of the GPU, and the stream would wait before and after it. The host waits, then reads.
 int64_t* device_address(int64_t* pinned);
 void copy_to_host(const int64_t* values, int64_t n, int64_t* host, CudaStream);
 }  // namespace cuda

@@ -115,14 +115,12 @@ struct Jobs {
   __device__ int64_t splat(int64_t job) const { return job / n_ranks * kScatterBlock; }
 };
 
-// The number of splats of a run that fit the group, for a run of `count` splats from position `first` of a
-// group with `size` splats.
+// How many of a run's `count` splats from position `first` on fit a group of `size` splats.
 __device__ int fitting_splats(int count, int64_t size, int64_t first) {
   return int(min(max(size - first, int64_t{0}), int64_t{count}));
 }
 
-// Writes the splats to the ranks of their masks, and the places [runs, M]. One warp per job, in a loop over
-// jobs.
+// Writes the splats to the ranks of their masks, and the places [runs, M]. A warp per job, in a loop.
 __global__ void __launch_bounds__(kScatterBlock, kSendPlaces)
     send_kernel(const __grid_constant__ ScatterSplats splats, const __grid_constant__ ScatterTargets targets,
                 const SendPlan* __restrict__ plan, const ScatterState state, int n_ranks) {

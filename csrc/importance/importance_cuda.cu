@@ -7,8 +7,7 @@
 namespace blitzgs::cuda {
 namespace {
 
-// A half-warp writes the weights of this many entries at its 16 pixels to shared memory; then each lane sums
-// over the pixels for one entry.
+// A half-warp writes the weights of this many entries at its pixels; then each lane sums those of one entry.
 constexpr int kGroup = 16;
 constexpr int kEntryStride =
     kHalfWarp + 4;  // words: lanes read quads of neighbouring entries without conflict
@@ -120,8 +119,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) contributions_kernel(const 
   const auto splat_at = [&](int at) {
     return thread < kBatch && at < count ? args.isect_splats[start + at] : -1;
   };
-  // `summed` is the splat of this thread's entry in the previous batch. Its sums are complete after the
-  // barrier.
+  // `summed` is the splat of this thread's entry in the previous batch. The barrier completes its sums.
   int32_t splat = splat_at(thread), next_splat = splat_at(thread + kBatch), summed = -1;
   int buffer = 0;
   const auto send_summed = [&] {

@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The mass cut: for each segment, the smallest set of items by descending weight (ties by ascending id) whose
-// weights sum to at least a share of the segment's total. One search serves all segments, without sorting and
-// without waiting on the host. The importance pass cuts each view's contributions at 99 % in this way
-// (BlitzGS, section 3.2).
+// weights sum to at least a share of the segment's total. One search serves all segments, without sorting or
+// waiting on the host. The importance pass cuts the weights of a view at 99 % (BlitzGS, section 3.2).
 //
 //   weights [P] int64 in [0, 2^62), segments [P] int32, owners [P] int32 and ids [N] int64: item i has the id
 //   ids[owners[i]], unique within its segment  ->  chosen [P]

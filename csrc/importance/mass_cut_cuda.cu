@@ -14,8 +14,7 @@ constexpr int kSegmentsAtOnce = 8;
 // pixels, have more.
 constexpr int kListedRounds = 2, kLaterRounds = 4;
 
-// A 64-bit sum as two words, because shared memory has an atomic addition of 32-bit words but none of 64-bit
-// ones, which would be a loop.
+// A 64-bit sum as two words, because in shared memory an atomic addition of 64 bits is a loop.
 struct WideSum {
   uint32_t low, high;
 
@@ -88,8 +87,7 @@ __global__ void __launch_bounds__(kThreads) scan_kernel(const MassCutArgs args, 
   }
 }
 
-// until: the sum of the values of a block's threads up to and including this one. total: the sum over all
-// threads.
+// until: the sum over a block's threads up to and including this one. total: over all threads.
 struct BlockScan {
   int64_t until, total;
 };

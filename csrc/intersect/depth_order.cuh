@@ -15,8 +15,7 @@
 
 namespace blitzgs::cuda {
 
-// The owned tiles of one tile row that a splat touches. Tile numbers count from tile_begin and fit 32 bits
-// (intersect_op.cpp).
+// The owned tiles of one tile row that a splat touches. Tile numbers count from tile_begin, in 32 bits.
 struct Owned {
   int first, last;  // tiles [first, last)
   int ty;           // the tile row in its image
@@ -86,8 +85,7 @@ struct alignas(16) Touched {
       word = rows[i];
       through = (word & kCounts) * kOnes;
     }
-    // Finds the first byte of `through` that is larger than k. Bytes are at most 60, so the subtraction does
-    // not borrow between them.
+    // Finds the first byte of `through` that is larger than k. Bytes are at most 60, so none borrows.
     const uint32_t reached = ((through | kHighBits) - (k + 1) * kOnes) & kHighBits;
     const int bit = (__ffs(reached) - 1) & 24;
     return start + (bit >> 3) * tiles_x + (word >> (bit + 4) & 15u) - 8 + k - (through << 8 >> bit & 255u);
@@ -175,8 +173,7 @@ struct DepthDigits {
 };
 
 // The first launch of intersect(). Finds the range of the depths that each block reads (ranges
-// [kRangeBlocks]), one thread per splat in a grid-stride loop, and sets the counters of the following kernels
-// to zero.
+// [kRangeBlocks]), one thread per splat in a grid-stride loop, and clears the counters of later kernels.
 __global__ void __launch_bounds__(kRangeThreads)
     range_kernel(const IntersectInput<float> in, DepthRange* ranges, uint4* zeros, int64_t n_zeros) {
   wait_for_earlier_kernels();

@@ -71,8 +71,7 @@ bool radix_pass(const Keyed<Key>* from, Keyed<Key>* to, int64_t n, int shift) {
   return true;
 }
 
-// Orders each run of splats with equal depths by id. Before, they are in splat order, because the sort is
-// stable.
+// Orders each run of splats with equal depths by id. The stable sort left them in splat order.
 template <class Key>
 void order_ties(Keyed<Key>* splats, int64_t n, const int64_t* ids) {
   for (int64_t begin = 0; begin < n;) {
@@ -102,8 +101,7 @@ const Keyed<KeyOf<T>>* sort_splats(const IntersectInput<T>& in, Workspace& works
   return splats;
 }
 
-// The number of pieces is the number of threads, or fewer if one counter per tile and piece would take too
-// much memory.
+// The number of pieces is the number of threads, or fewer where their counters would take too much memory.
 int choose_pieces(int64_t n_tiles) {
   constexpr int64_t kMaxCounts = 1 << 25;
   return int(std::clamp<int64_t>(kMaxCounts / std::max<int64_t>(n_tiles, 1), 1, num_threads()));

@@ -1,17 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
 // The tiles' lists (intersect.h) on CUDA:
 // 1. range_kernel, depth_keys_kernel, three passes of sweep_kernel and order_ties_kernel sort the splats by
-// (depth, id) and find the tiles of each splat, which they keep in 16 bytes, so that the data of all splats
-// fit into the L2 cache when step 2 gathers them in depth order (depth_order.cuh, radix_sweep.cuh).
+//    (depth, id) and find the tiles of each splat, which they keep in 16 bytes, so that the data of all
+//    splats fit into the L2 cache when step 2 gathers them in depth order (depth_order.cuh, radix_sweep.cuh).
 // 2. emit_kernel writes the list entries in this order, with the tile as key (16 bits if there are few
-// enough). It leaves large splats to emit_large_kernel, which has a warp for each: neighbours in depth are
-// often large together, as everything close to a camera is.
+//    enough). It leaves large splats to emit_large_kernel, which has a warp for each: neighbours in depth are
+//    often large together, as everything close to a camera is.
 // 3. Passes of sweep_kernel, a stable radix sort, order the entries by tile and keep their order otherwise.
 // 4. tile_offsets_kernel finds where each tile's list begins.
 //
 // (The renderer of 3DGS sorts the entries once, by tile and depth; Kerbl et al. 2023, section 6.) This file
-// is compiled without FMA contraction (cmake/cuda.cmake), like the projection: both must count the same
-// tiles.
+// is compiled without FMA contraction (cmake/cuda.cmake), like the projection.
 #include <cub/device/device_reduce.cuh>
 
 #include <cuda/std/functional>
@@ -182,7 +181,7 @@ __global__ void __launch_bounds__(kThreads)
   const int lane = threadIdx.x % 32, n = *n_large;
   if (int(blockIdx.x) * kWarps >= n) return;
   __syncthreads();
-  const tiles::Divider tile_of(in.grid.tile_size);
+  const TileDivider tile_of(in.grid.tile_size);
   for (int i = blockIdx.x * kWarps + threadIdx.x / 32; i < n; i += gridDim.x * kWarps) {
     const int32_t splat = large_splats[i];
     int64_t at = all_touched[splat].begin();

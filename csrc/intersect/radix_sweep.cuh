@@ -87,8 +87,7 @@ template <int kBits, class Key, class State>
 __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass<Key, State> pass) {
   constexpr int kBins = 1 << kBits, kWarps = kSweepThreads / 32;
   static_assert(kBins <= kSweepThreads);
-  // The two flags of a state: the other bits are the block's own count, or the count of all blocks up to and
-  // including this one.
+  // The two flags of a state: the other bits are the block's own count, or that of all blocks up to this one.
   constexpr State kOwn = State{1} << (8 * sizeof(State) - 2), kThrough = kOwn << 1;
   extern __shared__ int32_t staged_values[];
   auto* const staged_keys = reinterpret_cast<Key*>(staged_values + kSweepTile);
@@ -191,8 +190,7 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
 #pragma unroll
   for (int k = 0; k < kSweepItems; ++k) staged_values[places[k]] = values[k];
   __syncthreads();
-  // The pairs of one digit are neighbours in shared memory, so neighbouring threads write to neighbouring
-  // addresses.
+  // The pairs of one digit are neighbours in shared memory, so neighbouring threads write side by side.
 #pragma unroll
   for (int k = 0; k < kSweepItems; ++k) {
     const int at = threadIdx.x + k * kSweepThreads;

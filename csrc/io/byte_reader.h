@@ -15,8 +15,7 @@
 #include <type_traits>
 #include <vector>
 
-// Checked reading of untrusted binary data: before a reader allocates or skips bytes, it checks that the file
-// has so many.
+// Checked reading of untrusted binary data: a reader that allocates or skips bytes has checked their number.
 namespace blitzgs::io {
 
 static_assert(std::endian::native == std::endian::little, "the binary formats are little endian");
@@ -50,8 +49,7 @@ class ByteReader {
   void skip(uint64_t n, const char* what) { read_bytes(nullptr, n, what); }
   std::string read_c_string(const char* what);
 
-  // Reads a uint64 count of records of at least `min_bytes` bytes each. Throws if the file has fewer bytes
-  // left.
+  // Reads a uint64 count of records of at least `min_bytes` bytes each. Throws if fewer are left.
   uint64_t read_count(uint64_t min_bytes, const char* what);
   void check_count(uint64_t count, uint64_t min_bytes, const char* what) const;
 
@@ -74,8 +72,8 @@ class ByteReader {
 
 // Lines and numbers of untrusted text, independent of the locale.
 
-// Reads all of `text` as a number; false if it is none. A sign + is allowed, which std::from_chars refuses.
-// A real number beyond the range of T becomes zero or infinity with its sign, as it does in other readers; an
+// Reads all of `text` as a number; false if it is none. A sign + is allowed, which std::from_chars refuses. A
+// real number beyond the range of T becomes zero or infinity with its sign, as it does in other readers; an
 // integer beyond it is refused.
 template <class T>
 bool parse_number(std::string_view text, T& value) {

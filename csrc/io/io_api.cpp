@@ -53,8 +53,7 @@ struct blitzgs_io_column {
 
 struct blitzgs_io_reply;
 
-// Runs a function of io_api.cpp. The columns of the reply live until it is freed. Null: no memory for the
-// reply.
+// Runs a function of io_api.cpp. The columns of the reply live until it is freed. Null: no memory.
 BLITZGS_IO_API blitzgs_io_reply* blitzgs_io_call(const char* name, const blitzgs_io_column* arguments,
                                                  size_t count);
 BLITZGS_IO_API int blitzgs_io_status(const blitzgs_io_reply* reply);
@@ -273,8 +272,7 @@ void decode_qoi(Arguments& arguments, Reply& reply) {
   io::decode_qoi(file, reply.add_uninitialised(size_t{3} * size.height * size.width));
 }
 
-// Flags in memory that several processes share: a process that sees a flag also sees all that was written
-// before the flag was set.
+// Flags in memory that several processes share: a process that sees a flag sees all that was written before.
 std::atomic_ref<uint8_t> flag_of(Arguments& arguments) {
   return std::atomic_ref(*const_cast<uint8_t*>(arguments.take<uint8_t>().data()));
 }

@@ -103,8 +103,7 @@ class Checker {
     }
     uint64_t blocks = 0;
     for (const Component& component : components_) blocks += count_blocks(component);
-    // A height of 0 means that the height follows after the first scan. In such files only the markers are
-    // checked.
+    // A height of 0 means that the height follows after the first scan. There only markers are checked.
     walked_ = walked_ && width_ > 0 && height_ > 0 && blocks <= kMaxBlocks;
   }
 
@@ -147,8 +146,7 @@ class Checker {
     Component* component;
   };
 
-  // The coefficients of a scan, in zigzag order, and whether it refines coefficients of earlier scans by one
-  // bit.
+  // The coefficients of a scan, in zigzag order, and whether it refines earlier ones by a bit.
   struct Band {
     unsigned first = 0, last = 63;
     bool refines = false;

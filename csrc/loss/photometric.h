@@ -16,10 +16,10 @@
 // weights of view b are divided by samples[b]. The kernel also writes what one visible Gaussian weighs in two
 // terms of the training loss (MeanTerms).
 //
-// SSIM is computed from four windowed quantities: mean(x), e = mean(x) - mean(y), P = E[x^2 + y^2] and Q =
-// E[(x - y)^2]. With A = mean(x)^2 + mean(y)^2 + C1, V = Q - e^2 (the variance of x - y) and S = P -
-// mean(x)^2 - mean(y)^2 + C2, it is SSIM = (1 - e^2 / A) (1 - V / S). The textbook quotient needs five, and
-// cancels in flat regions (in float32 for values up to some 10).
+// SSIM is computed from four windowed quantities: mean(x), e = mean(x) - mean(y), P = E[x^2 + y^2] and
+// Q = E[(x - y)^2]. With A = mean(x)^2 + mean(y)^2 + C1, V = Q - e^2 (the variance of x - y) and
+// S = P - mean(x)^2 - mean(y)^2 + C2, it is SSIM = (1 - e^2 / A) (1 - V / S). The textbook quotient needs
+// five, and cancels in flat regions (in float32 for values up to some 10).
 //
 // The sums are written in parts, double [B, K, 2], each over a fixed block of pixels in a fixed order; the op
 // report (below) adds them up. The result repeats bit for bit for any number of threads.
@@ -59,8 +59,7 @@ struct PhotometricArgs {
   T window[kSsimTaps];
 };
 
-// The owned columns [begin, end) of one pixel row. They form an interval because the range of tiles is
-// contiguous.
+// The owned columns [begin, end) of one pixel row. Tiles are a range, so they are one interval.
 struct OwnedColumns {
   int begin, end;
 };

@@ -1,13 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 // A conservative test whether a view may see a Gaussian, from its mean and an upper bound sigma on its
-// standard deviations, for blocks and rows of the table (active/blocks.h) and the prefilter of the
-// projection.
+// standard deviations, for blocks and rows of the table (active/blocks.h) and the projection's prefilter.
 //
 // A Gaussian with axes up to sigma cannot be seen iff its mean lies behind the near plane, beyond the far
 // plane, or beyond one image border by more than a splat can reach: half-width of alpha >= 1/255 is at most
 // sqrt(2 ln 255) sqrt(|J row|^2 sigma^2 + eps2d) pixels for an opacity of at most 1, with |J row| <= f / z
-// max |row_x - u row_z| over the clamped slopes u. Multiplied by z, each condition is a linear inequality n .
-// p + d + k sigma >= 0.
+// max |row_x - u row_z| over the clamped slopes u. Multiplied by z, each condition is a linear inequality
+// n . p + d + k sigma >= 0.
 #pragma once
 #include "math/projection.h"
 #include "math/vec.h"
@@ -28,8 +27,6 @@ struct alignas(16) FrustumPlane {
 struct Frustum {
   FrustumPlane planes[kFrustumPlanes];
 };
-
-namespace frustum {
 
 struct PoseRow {
   double n[3], offset;
@@ -67,24 +64,21 @@ BLITZGS_HD double largest_gradient(const PoseRow& row, const PoseRow& row_z, dou
   return std::sqrt(larger(squares[0], squares[1]));
 }
 
-}  // namespace frustum
-
 template <class T>
 BLITZGS_HD Frustum make_frustum(const Camera<T>& camera, int width, int height, T near_plane, T far_plane,
                                 T eps2d) {
-  using frustum::make_plane, frustum::pose_row;
   constexpr double kReach = 3.34;  // > sqrt(2 ln 255)
-  const frustum::PoseRow x = pose_row(camera.row_x, camera.translation.x),
-                         y = pose_row(camera.row_y, camera.translation.y),
-                         z = pose_row(camera.row_z, camera.translation.z);
+  const PoseRow x = pose_row(camera.row_x, camera.translation.x),
+                y = pose_row(camera.row_y, camera.translation.y),
+                z = pose_row(camera.row_z, camera.translation.z);
   Frustum view;
   view.planes[0] = make_plane(z, 1.0, z, 0.0, -double(near_plane), 0.0);
   // A depth is rounded before it is compared with the far plane.
   view.planes[1] = make_plane(z, -1.0, z, 0.0, 1.000001 * double(far_plane), 0.0);
   const double blur = kReach * std::sqrt(double(eps2d)) + 1.0;  // one pixel of slack
-  const auto add_borders = [&](FrustumPlane* planes, const frustum::PoseRow& row, double focal, double centre,
+  const auto add_borders = [&](FrustumPlane* planes, const PoseRow& row, double focal, double centre,
                                double size, double low, double high) {
-    const double k = kReach * std::fabs(focal) * frustum::largest_gradient(row, z, low, high) * 1.00001;
+    const double k = kReach * std::fabs(focal) * largest_gradient(row, z, low, high) * 1.00001;
     planes[0] = make_plane(row, focal, z, centre + blur, 0.0, k);
     planes[1] = make_plane(row, -focal, z, size - centre + blur, 0.0, k);
   };

@@ -68,9 +68,8 @@ BLITZGS_HD void rotation_columns_vjp(const UnitQuaternion<T>& q, const Columns3<
   v_q[3] += q.inverse_norm * (v_z - along * z);
 }
 
-// Activations, and the 3D covariance (Kerbl et al. 2023, Eq. 6) in factored form: Sigma = A A^T with
-// A = R(q) diag(s). The code keeps the factor A, because the projection is more accurate from it
-// (projection.h).
+// Activations, and the 3D covariance (Kerbl et al. 2023, Eq. 6) in factored form: Sigma = A A^T with A = R(q)
+// diag(s). The projection is more accurate from A (projection.h).
 
 template <class T>
 BLITZGS_HD T sigmoid(T logit) {

@@ -77,8 +77,7 @@ MortonFrame morton_frame_of(const T* points, int64_t n) {
 }  // namespace blitzgs
 
 #ifdef __CUDACC__
-// The Morton frame of a cloud of points, computed on the GPU so that the host need not wait for
-// it.
+// The Morton frame of a cloud of points, computed on the GPU: the host need not wait.
 namespace blitzgs::cuda {
 
 // Maps floats to integers of the same order, so that atomicMin and atomicMax find the bounds of the cloud.
@@ -102,8 +101,7 @@ static __global__ void reset_bounds(MortonBounds* bounds) {
   if (axis == 3) bounds->finite = 0;
 }
 
-// Finds the bounding box and the number of the finite points of points [n, 3]. One thread per point, in a
-// grid-stride loop.
+// Finds the bounding box and the number of the finite points of points [n, 3]. A thread per point, in a loop.
 static __global__ void find_bounds(const float* points, int64_t n, MortonBounds* bounds) {
   int32_t low[3] = {INT32_MAX, INT32_MAX, INT32_MAX}, high[3] = {INT32_MIN, INT32_MIN, INT32_MIN}, finite = 0;
   for (int64_t i = blockIdx.x * int64_t{blockDim.x} + threadIdx.x; i < n;

@@ -9,8 +9,8 @@
 //
 // The test is conservative: the ellipse is enlarged by a relative and absolute 2e-5 in q, and the interval by
 // some float roundings. This covers the rounding of the test and of the rasterisers, which evaluate q as
-// factor_conic() writes it. A splat that is not finite, not convex (a <= 0 or c <= 0) or too faint (opacity <
-// 1/255) touches no tile.
+// factor_conic() writes it. A splat that is not finite, not convex (a <= 0 or c <= 0) or too faint
+// (opacity < 1/255) touches no tile.
 //
 // The count of one kernel is the buffer size of another, so the expressions here use mul() and mul_add(),
 // which no compiler contracts differently.
@@ -43,8 +43,6 @@ BLITZGS_HD TileGrid make_tile_grid(int n_cameras, int width, int height, int til
   return grid;
 }
 
-namespace tiles {
-
 // Clamp a value; NaN becomes the lower bound in the first and the upper bound in the second.
 template <class T>
 BLITZGS_HD T clamp_nan_low(T value, T low, T high) {
@@ -56,18 +54,16 @@ BLITZGS_HD T clamp_nan_high(T value, T low, T high) {
 }
 
 // x / size for x >= 0. If the size is a power of two, as tile sizes usually are, the division is a shift.
-struct Divider {
+struct TileDivider {
   int size, shift;
 
-  BLITZGS_HD explicit Divider(int tile_size) : size(tile_size), shift(-1) {
+  BLITZGS_HD explicit TileDivider(int tile_size) : size(tile_size), shift(-1) {
     if ((tile_size & (tile_size - 1)) == 0) {
       for (shift = 0; (1 << shift) < tile_size;) ++shift;
     }
   }
   BLITZGS_HD int operator()(int x) const { return shift >= 0 ? x >> shift : x / size; }
 };
-
-}  // namespace tiles
 
 // The factor L of conic = L^T L, so q = (l11 dx + l21 dy)^2 + (l22 dy)^2, which is never negative and does
 // not cancel for thin splats. A conic that rounding made indefinite gets l22 = 0: a splat that is so long is
@@ -135,8 +131,8 @@ BLITZGS_HD bool make_ellipse(const T* conic, T opacity, SplatEllipse<T>* ellipse
 // if there is none. A bound that is NaN is ignored.
 template <class T>
 BLITZGS_HD void pixels_between(T low, T high, int size, int* first, int* last) {
-  *first = int(std::ceil(tiles::clamp_nan_low(low - T(0.5), T(0), T(size))));
-  *last = int(std::floor(tiles::clamp_nan_high(high - T(0.5), T(-1), T(size - 1))));
+  *first = int(std::ceil(clamp_nan_low(low - T(0.5), T(0), T(size))));
+  *last = int(std::floor(clamp_nan_high(high - T(0.5), T(-1), T(size - 1))));
 }
 
 // Returns x at one end of the ellipse's interval over a band of rows. side is -1 for the left end and 1 for
@@ -163,15 +159,14 @@ struct TileRows {
   int row_first, row_last;  // pixel rows
   int first, last;          // tile rows; first > last if there is none
 
-  // Sets the tiles [*begin, *end) that the splat touches in tile row ty, from first to last. Returns false if
-  // there is none.
-  BLITZGS_HD bool interval(int ty, int width, const tiles::Divider& tile_of, int* begin, int* end) const {
+  // Sets the tiles [*begin, *end) that the splat touches in tile row ty, from first to last; false: none.
+  BLITZGS_HD bool interval(int ty, int width, const TileDivider& tile_of, int* begin, int* end) const {
     const int top = ty * tile_of.size, bottom = top + tile_of.size - 1;
     const int band_first = row_first > top ? row_first : top,
               band_last = row_last < bottom ? row_last : bottom;
     const T low = T(band_first) + T(0.5) - y, high = T(band_last) + T(0.5) - y;
-    const T left = chord_end(ellipse, x, y, tiles::clamp_nan_low(-ellipse.turn, low, high), T(-1));
-    const T right = chord_end(ellipse, x, y, tiles::clamp_nan_low(ellipse.turn, low, high), T(1));
+    const T left = chord_end(ellipse, x, y, clamp_nan_low(-ellipse.turn, low, high), T(-1));
+    const T right = chord_end(ellipse, x, y, clamp_nan_low(ellipse.turn, low, high), T(1));
     int column_first, column_last;
     pixels_between(left, right, width, &column_first, &column_last);
     *begin = tile_of(column_first);
@@ -182,7 +177,7 @@ struct TileRows {
 
 template <class T>
 BLITZGS_HD TileRows<T> find_tile_rows(const T* mean2d, const T* conic, T opacity, int height,
-                                      const tiles::Divider& tile_of) {
+                                      const TileDivider& tile_of) {
   constexpr T kRounding = sizeof(T) == 4 ? T(1e-6) : T(1e-14);
   TileRows<T> rows{};
   rows.last = -1;
@@ -202,7 +197,7 @@ BLITZGS_HD TileRows<T> find_tile_rows(const T* mean2d, const T* conic, T opacity
 template <class T, class F>
 BLITZGS_HD void for_each_tile_row(const T* mean2d, const T* conic, T opacity, int width, int height,
                                   int tile_size, const F& f) {
-  const tiles::Divider tile_of(tile_size);
+  const TileDivider tile_of(tile_size);
   const TileRows<T> rows = find_tile_rows(mean2d, conic, opacity, height, tile_of);
   for (int ty = rows.first; ty <= rows.last; ++ty) {
     int begin, end;

@@ -53,8 +53,7 @@ BLITZGS_HD bool is_bad(T value, bool zero_is_bad) {
 //
 // counts the keys with ordered bits b, b >> (shift + width) = prefix, by the digit (b >> shift) mod 2^width.
 // blitzgs/distributed/selection.py finds the k-th smallest key over all ranks by such counts: find_digit_
-// takes the next digit, and keys_up_to marks the keys that are not above the one that was found. Each op
-// reads its inputs once.
+// takes the next digit, and keys_up_to marks the keys up to the one found.
 
 BLITZGS_HD float sampling_key(float weight, int64_t id, int64_t seed, int64_t event) {
   const uint64_t hash = hash_key(hash_key(hash_key(0, seed), event), id);

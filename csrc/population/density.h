@@ -67,8 +67,7 @@ struct DensityStats {
 
 // The features of candidates of densification, from which the spawn gate predicts whether their children
 // survive (BlitzGS, section 3.2). The features are those of blitzgs.spawn.candidates.FEATURES. Each is
-// computed in float64 and rounded once, so that CPU and CUDA agree but for rare differences in the last bit.
-// The cost is O(M).
+// computed in float64 and rounded once, so that CPU and CUDA rarely differ, in the last bit. O(M).
 
 constexpr int kSpawnFeatures = 10;
 

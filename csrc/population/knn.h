@@ -10,8 +10,7 @@
 // tree, whose nodes are boxes around 8 boxes of the level below. A query starts in the leaf of its point and
 // goes up the tree; at each level it descends into the siblings whose box is nearer than the k-th neighbour
 // so far. The distance to a box is computed by the same operations as the distance to a point, so rounding is
-// monotone and the query misses no neighbour. The cost is O(N log N); results do not depend on the number of
-// threads.
+// monotone and the query misses no neighbour. The cost is O(N log N).
 #pragma once
 #include <cmath>
 

@@ -27,15 +27,14 @@ __global__ void __launch_bounds__(kThreads)
   if (bad) *checked.bad = 1;
 }
 
-// A row of features in shared memory. Feature i of all threads is contiguous, so lanes have no bank
-// conflicts.
+// A row of features in shared memory. One feature is contiguous, without bank conflicts.
 struct StridedRow {
   const float* first;
   __device__ float operator[](int feature) const { return first[feature * kThreads]; }
 };
 
-// sums [M] (density.h), one thread per row. All threads of a block take the same tree at a time, so that
-// its nodes stay in the L1 cache.
+// sums [M] (density.h), one thread per row. All threads of a block take the same tree at a time, so that its
+// nodes stay in the L1 cache.
 __global__ void __launch_bounds__(kThreads) tree_sums_kernel(const TreeSumsArgs args) {
   extern __shared__ float shared[];
   wait_for_earlier_kernels();

@@ -16,9 +16,9 @@
 //
 // On CUDA, project() launches three kernels:
 // 1. prefilter (project_cuda.cu) lists the candidates that some view may see by their means and scales, with
-// those views;
+//    those views;
 // 2. write_splats (write_splats_cuda.cu) projects the listed pairs, counts those that are splats, and writes
-// the splats in order, in one launch (two without a capacity);
+//    the splats in order, in one launch (two without a capacity);
 // 3. color_splats (project_cuda.cu) computes the colour of each splat.
 //
 // project_bwd (project_bwd_device.cuh on CUDA) visits each visible Gaussian once, recomputes its splats and
@@ -156,8 +156,7 @@ struct ProjectCapacity {
 };
 
 // gaussian_ids [P] and camera_ids [P]: the Gaussian and the view of each splat. visible_ids [U]: the
-// Gaussians that have splats. The splats of visible_ids[u] are splat_offsets[u] to splat_offsets[u + 1] - 1;
-// [U + 1].
+// Gaussians that have splats. Those of visible_ids[u] begin at splat_offsets[u]; [U + 1].
 struct ProjectIds {
   int32_t *gaussian_ids, *camera_ids, *visible_ids, *splat_offsets;
 };
@@ -192,8 +191,7 @@ struct ProjectGradients {
   bool dense = false;
 };
 
-// Arrays that are set to zero together; on CUDA by one launch, because each launch takes the host
-// microseconds.
+// Arrays that are set to zero together; on CUDA by one launch, which takes the host microseconds.
 template <class T>
 struct ZeroedArrays {
   static constexpr int kCount = 5;

@@ -30,8 +30,7 @@ __device__ float largest_scale(const Inputs& in, int64_t id) {
 }
 
 // Finds the views that may see each of the kPrefilterBatch candidates first, first + 32, ...: from their
-// means, then, if some view still may see it, from their scales. Writes these views as bits, and the
-// Gaussians.
+// means, then, if some view still may see it, from their scales. Writes these views, as bits, and ids.
 __device__ void quick_views(const Inputs& in, int64_t n_candidates, const Frustum* frusta, int64_t first,
                             uint32_t* maybe, int32_t* ids) {
   Vec3<float> means[kPrefilterBatch];

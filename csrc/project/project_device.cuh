@@ -176,8 +176,7 @@ struct ShStage {
       if (row < rows) reinterpret_cast<float4*>(out + stride * row)[quad] = {0.f, 0.f, 0.f, 0.f};
     }
   }
-  // Writes each lane's row to row `id` of `out` (id < 0: not at all), only the coefficients that the degree
-  // uses.
+  // Writes each lane's row to row `id` of `out` (id < 0: not at all), as far as the degree goes.
   __device__ __forceinline__ void scatter(float* out, int64_t stride, int32_t id, int lane) const {
 #pragma unroll
     for (int i = 0; i < Row::kQuads; ++i) {
@@ -227,8 +226,7 @@ inline int64_t most_prefilter_turns(int64_t candidates) {
   return in_small < 2 * kTurnsWanted ? in_small : in_large > 2 * kTurnsWanted ? in_large : 2 * kTurnsWanted;
 }
 
-// A turn of write_splats: up to kSplatThreads Gaussians, one per thread, with at most kMaxPairs pairs of a
-// Gaussian and a view.
+// A turn of write_splats: up to kSplatThreads Gaussians, one per thread, with at most kMaxPairs pairs.
 inline constexpr int kSplatThreads = 128, kMaxPairs = 512;
 
 __host__ __device__ inline int projected_at_once(int n_views) {

@@ -261,8 +261,7 @@ struct ParameterGradients {
 };
 
 // Takes the gradients of the activated Gaussian back to the stored parameters (log scales and logit if raw)
-// and writes them to `out`. axis_weight: the weight of the smallest axis in the regularisers, summed over the
-// splats.
+// and writes them to `out`. axis_weight: the regularisers' weight of the smallest axis, over the splats.
 template <class T>
 BLITZGS_HD void activate_gaussian_vjp(const ActivatedGaussian<T>& gaussian, bool raw,
                                       const GaussianGradient<T>& gradient, T axis_weight,

@@ -32,8 +32,7 @@ struct StepRows {
   __device__ void take(Shared& shared, const Own& own, const WarpRows& warp, TripleStage& triple,
                        const Vec3<float>& v_mean, const float4& v_quat, const Vec3<float>& v_scale,
                        float v_opacity) const {
-    // Initialised because the compiler would keep these on the stack if lanes without a Gaussian left them
-    // undefined.
+    // Initialised, because the compiler would keep on the stack what lanes without a Gaussian left undefined.
     StepPack<0, 1> means[3]{};
     StepPack<1, 4> quat{};
     StepPack<2, 1> scales[3]{};

@@ -72,8 +72,7 @@ inline void prepare(const char* what, const RasterizeInput<float>& in, PackedSpl
 // List entries that a block copies at a time.
 inline constexpr int kForwardBatch = 256;
 
-// The alphas of four entries of a batch at a pixel, zero for entries that are not composited, and whether
-// each entry is composited.
+// The alphas of four entries of a batch at a pixel, zero if not composited, and whether they are.
 struct QuadAlphas {
   float at[4];
   bool touched[4];

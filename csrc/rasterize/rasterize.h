@@ -3,8 +3,7 @@
 // 3 and 5; Kerbl et al. 2023, Eq. 3), and its gradient. Culling inside the kernels is conservative. They
 // evaluate
 //   q = a dx^2 + 2 b dx dy + c dy^2,  (dx, dy) = pixel centre - mean2d,  conic = (a, b, c)
-// through factor_conic() of math/tiles.h, because the slack of the tile test covers the rounding of that
-// form.
+// through factor_conic() of math/tiles.h, whose rounding the slack of the tile test covers.
 //
 //   means2d [P, 2], conics [P, 3], opacities [P], colors [P, D], backgrounds [B, D] or null, isect_splats and
 //   tile_offsets from intersect  ->  renders [B, H, W, D]; transmittances [B, H, W] (final T; alpha = 1 - T);
@@ -103,8 +102,7 @@ struct RasterizeAux {
 //   [R, strongest]. Row slots[b, y, x] of the results is that of a pixel; a slot outside [0, R) is no row.
 //   Rows without a pixel are not written. Without slots, the rows are the pixels, R = B H W.
 //
-// The cost is that of compositing without colours, and O(strongest) for each splat that is among the
-// strongest so far.
+// The cost is that of compositing without colours, and O(strongest) for each of the strongest so far.
 template <class T>
 struct PixelSplats {
   const int32_t* slots;  // null: a row for each pixel

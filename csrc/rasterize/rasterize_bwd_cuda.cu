@@ -34,8 +34,7 @@ __device__ __forceinline__ float4 add_halves(float4 a) {
 }
 
 // Sums a group of entries, list[0 .. filled) of the half-warp's list, over the subtile's pixels, one lane per
-// entry. Adds the sums to the splats' gradients atomically or, if DETERMINISTIC, stores them in
-// shared.partial.
+// entry. Adds them to the splats' gradients atomically or (DETERMINISTIC) stores them in shared.partial.
 template <int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC>
 __device__ __forceinline__ void flush_group(BackwardShared<CHANNELS, DETERMINISTIC>& shared,
                                             const BackwardArguments& args, const TilePlace& tile,
@@ -83,8 +82,7 @@ __device__ __forceinline__ void flush_group(BackwardShared<CHANNELS, DETERMINIST
 }
 
 // Returns the state of a pixel behind its last entry, and writes the pixel's gradient to shared.v_render.
-// That of a pixel without splats (last is 0) counts as zero, also if it is NaN, as that of 1 / depth is
-// there.
+// That of a pixel without splats (last is 0) counts as zero, also if it is NaN, as of 1 / depth.
 template <int CHANNELS, bool WIDE, class Shared>
 __device__ __forceinline__ BackwardPixel<CHANNELS> start_pixel(Shared& shared, const BackwardArguments& args,
                                                                const Pixel& pixel, int last, int camera) {

@@ -34,8 +34,7 @@ void find_used_entries(const RasterizeInput<T>& in, const int32_t* last_ids, int
   });
 }
 
-// The owned tiles [begin, end) whose partial gradients are in memory together, and the number of these
-// gradients.
+// The owned tiles [begin, end) whose partial gradients are in memory together, and their number.
 struct Chunk {
   int64_t begin, end;
   int64_t partials;
@@ -95,8 +94,7 @@ void write_gradients(const RasterizeInput<T>& in, const T* sums, int width,
 
 }  // namespace
 
-// Memory for prepared splats in float32. In float64, which serves for checks, the backward pass prepares the
-// splats again.
+// Memory for prepared splats in float32. In float64, for checks, the backward pass prepares them again.
 int64_t rasterize_splat_bytes(int) { return sizeof(PreparedSplat<float>); }
 
 bool rasterize_orders_tiles(const TileGrid&) { return false; }

@@ -13,8 +13,7 @@ struct ForwardArguments : ChunkInput {
 
 // Composites four entries of a batch into the colour of a pixel, and sets *last to the byte offset of the
 // last of them that touches the pixel. One loop computes the weights, *last and the colour: if they were in
-// separate loops, the compiler would emit divergent branches around the colours instead of predicated
-// instructions.
+// separate loops, the compiler would emit divergent branches around the colours.
 template <int CHANNELS>
 __device__ __forceinline__ void add_colors(const char* entries, const QuadOffsets& offsets,
                                            const Pixel& pixel, Compositor<>& state, float* color,
@@ -51,8 +50,7 @@ __device__ __forceinline__ void write_pixel(const ForwardArguments& args, const 
   args.out.last_ids[pixel.index] = last;
 }
 
-// The most 16-byte zeros that a thread of forward_kernel writes. If there are too few tiles for this, a
-// memset clears the gradients.
+// The most 16-byte zeros that a thread of forward_kernel writes. With too few tiles for this, a memset does.
 constexpr int kMaxZeros = 16;
 constexpr int kQuads = kSplatGradient / 4;  // 16-byte zeros per splat
 

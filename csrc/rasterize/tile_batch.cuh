@@ -5,8 +5,7 @@
 // A block composites a tile of 16x16 pixels, a half-warp a subtile of 4x4, a lane a pixel. The block copies
 // the tile's list to shared memory in batches. Each thread tests one entry against all sixteen subtiles,
 // conservatively, and from these tests each half-warp makes the list of the entries that may touch its
-// subtile: a splat of a few pixels touches about three. The two halves of a warp visit different lists in
-// lockstep.
+// subtile: a splat of a few pixels touches about three. A warp's halves visit their lists in lockstep.
 #pragma once
 #include "math/tiles.h"
 #include "rasterize/rasterize.h"

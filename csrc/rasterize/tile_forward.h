@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Compositing one tile on the CPU, front to back (docs/image.md, sections 3 and 5). A sink takes the weights
 // alpha T: ColorSink makes the image, ContributionSink the contributions of splats, PixelSink those of
-// pixels. Compiled twice, plain and with AVX2 (tile_kernels.h); both and their callers share plain data
-// alone.
+// pixels. Compiled twice, plain and with AVX2 (tile_kernels.h); they share plain data alone.
 #pragma once
 #include <algorithm>
 #include <atomic>

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // The CPU kernels of one tile, forward (tile_forward.h) and backward, over the lane types of math/lanes.h.
-// They are compiled twice, plain and with AVX2; everything here has internal linkage, so that the linker
-// cannot mix the two.
+// They are compiled twice, plain and with AVX2; internal linkage keeps the two apart.
 //
 // A kernel takes the splats of the list one after the other, forward front to back, backward back to front.
 // For each splat it visits the pixel rows that the splat's ellipse meets, and in a row eight pixels at a time
@@ -36,8 +35,7 @@ BackwardState<T> start_backward(const TileJob<T>& tile) {
       state.transmittance[pixel] = tile.saved.transmittances[in];
       state.last[pixel] = tile.saved.last_ids[in];
       state.last_in_row[row] = std::max(state.last_in_row[row], state.last[pixel]);
-      // The gradient of a pixel without splats reaches none, also if it is NaN, as that of 1 / depth is
-      // there.
+      // The gradient of a pixel without splats reaches none, also if it is NaN, as of 1 / depth.
       if (state.last[pixel] == 0) continue;
       T behind = tile.saved.v_alphas ? -tile.saved.v_alphas[in] : T(0);
       for (int c = 0; c < n_channels; ++c) {

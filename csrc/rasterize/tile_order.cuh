@@ -3,8 +3,7 @@
 // their numbers. The tiles of the last blocks should have short lists, so that no multiprocessor still works
 // on a long list when the others are done. Whole images end with rows of near ground, whose lists are short.
 // The tiles of one rank may end with the far rows of a view, so there the tiles with long lists come first.
-// Forward makes the order and keeps it for backward, which may differentiate fewer tiles than were
-// composited.
+// Forward makes the order and keeps it for backward, which may differentiate fewer tiles.
 #pragma once
 #include "common/cuda.cuh"
 #include "math/tiles.h"

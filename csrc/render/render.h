@@ -19,8 +19,7 @@ struct Alphas {
 // Gathers the same rows of several columns in one launch. A row of a column has `width` words of 4 bytes:
 //   column.to[i stride + k] = column.from[ids[i] width + k],  0 <= i < n,  0 <= k < width.
 // With a stride above the width, several columns are gathered side by side into one. ids int32 [n], rows of
-// the columns, not checked. known: null, or (CUDA) the number of valid ids, see valid_splat_count in
-// common/kernel.h.
+// the columns, not checked. known: null, or (CUDA) the number of valid ids, see valid_splat_count.
 
 constexpr int kMaxGatheredColumns = 8;
 
@@ -65,8 +64,7 @@ struct NumberedRows {
 //
 // With `order` [n], entry i of the arrangement is splat order[i]. Without it, splat i is the entry
 // images[i] * count + gaussians[i] of an arrangement that has an entry for each Gaussian in each image. A row
-// has `words` words of 4 bytes, and a row of the source begins `stride` words after the row before. Indices
-// are not checked.
+// has `words` words of 4 bytes, and rows of the source begin `stride` words apart. Indices are not checked.
 
 inline constexpr int kMaxArranged = 8;  // columns of one call
 

@@ -7,8 +7,7 @@
 #include "rasterize/rasterize_op.h"
 
 namespace blitzgs {
-// Colours, tile lists, compositing and alphas in one op, because each call of an op takes the host
-// microseconds.
+// Colours, tile lists, compositing and alphas in one op, because each takes the host microseconds.
 namespace {
 
 // Words of 4 bytes in the elements of a row behind its first `axis` dimensions.

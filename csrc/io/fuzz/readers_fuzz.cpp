@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Runs the readers of files that other programs write under libFuzzer (`make fuzz`). There is one program for
 // each target, which the build names in BLITZGS_FUZZ. A reader must either succeed or throw FormatError. The
-// sanitizers stop the program if it reads beyond the input, and libFuzzer stops it if it hangs or allocates
-// too much.
+// sanitizers stop the program if it reads beyond the input, libFuzzer if it hangs or allocates too much.
 #include <cstddef>
 
 #include "io/colmap.h"
