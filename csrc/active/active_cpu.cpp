@@ -37,8 +37,7 @@ struct CullViews {
 };
 
 // Returns the blocks that some view may see, in order.
-template <bool kGated>
-std::vector<ActiveBlock> list_blocks(const CullInputs& in, const CullViews& views) {
+template <bool kGated> std::vector<ActiveBlock> list_blocks(const CullInputs& in, const CullViews& views) {
   constexpr int64_t kPart = 1024;
   const int64_t blocks = blocks_of(in.rows.n);
   std::vector<std::vector<ActiveBlock>> parts((blocks + kPart - 1) / kPart);
@@ -59,8 +58,7 @@ std::vector<ActiveBlock> active_blocks(const CullInputs& in, const CullViews& vi
 }
 
 // Finds the views of the rows of mixed blocks, and the number of active rows of each block.
-template <bool kGated>
-void fill_plan(const CullInputs& in, const CullViews& views, const CullPlan& plan) {
+template <bool kGated> void fill_plan(const CullInputs& in, const CullViews& views, const CullPlan& plan) {
   parallel_rows(plan.capacity_blocks, 16, [&](int64_t place) {
     const auto& [block, seen] = plan.blocks[place];
     const int count = rows_in_block(in.rows.n, block);
@@ -92,8 +90,7 @@ void transpose_bits(uint32_t* words) {
 
 // Calls f(words, count, rows, sector) for each square of 32 rows and 32 columns. words: 32 zeros. count: the
 // existing rows. rows, sector: the words of the first row and the first column.
-template <class F>
-void for_each_square(const CullMask& mask, const F& f) {
+template <class F> void for_each_square(const CullMask& mask, const F& f) {
   parallel_rows(blocks_of(mask.n) * kSectorWords, 64, [&](int64_t group) {
     const auto count = int(std::clamp<int64_t>(mask.n - 32 * group, 0, 32));
     for (int64_t word = 0; word < mask.words; ++word) {

@@ -86,8 +86,7 @@ __global__ void __launch_bounds__(kBlockRows) transpose_kernel(const CullMask ma
   }
 }
 
-template <bool kToSectors>
-void transpose(const CullMask& mask, CudaStream stream) {
+template <bool kToSectors> void transpose(const CullMask& mask, CudaStream stream) {
   if (mask.n == 0 || mask.words == 0) return;
   transpose_kernel<kToSectors><<<unsigned(blocks_of(mask.n)), kBlockRows, 0, stream>>>(mask);
   check_launch("cull mask");

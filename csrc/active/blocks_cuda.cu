@@ -34,8 +34,7 @@ __global__ void list_blocks(const int32_t* ids, int64_t n, int32_t* list, int32_
 }
 
 // Returns the union of the boxes of each group of kLanes neighbouring lanes.
-template <int kLanes>
-__device__ __forceinline__ SweptBox box_around(SweptBox box) {
+template <int kLanes> __device__ __forceinline__ SweptBox box_around(SweptBox box) {
 #pragma unroll
   for (int offset = kLanes / 2; offset > 0; offset /= 2) {
     SweptBox other;

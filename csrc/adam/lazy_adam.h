@@ -54,22 +54,19 @@ constexpr int kAdamTable = 30;
 
 constexpr int kAdamColumns = 5;  // means, quats, scales, opacities, sh
 
-template <class T>
-struct AdamColumn {
+template <class T> struct AdamColumn {
   T *param, *exp_avg, *exp_avg_sq;
   const T* grad;  // [n, width], one row for each row of the list; null if rows only catch up
   int64_t width;
 };
 
 // The Gauss rule of one group: drift = m * (sum over both points of weight / (place sqrt(v) + eps)).
-template <class T>
-struct alignas(4 * sizeof(T)) AdamRule {
+template <class T> struct alignas(4 * sizeof(T)) AdamRule {
   T place[2], weight[2];
 };
 
 // The rules of the drift of rows whose parameters are at step `from` and catch up to step `to`.
-template <class T>
-struct PendingSteps {
+template <class T> struct PendingSteps {
   AdamRule<T> rules[kAdamGroups];
   int32_t from, to;
   T explicit_up_to;  // elements with sqrt(v) <= this take the steps one by one; negative: none
@@ -89,8 +86,7 @@ struct RatesArgs {
   BLITZGS_HD double ratio_of(int order) const { return ratio * std::pow(root, order); }
 };
 
-template <class T>
-struct AdamArgs {
+template <class T> struct AdamArgs {
   AdamColumn<T> columns[kAdamColumns];
   const int32_t* ids;       // [n], the rows, each once; null: those of long_ids
   const int64_t* long_ids;  // [n]; null: all n rows
@@ -171,8 +167,7 @@ BLITZGS_HD PendingSteps<T> pending_steps(const AdamArgs<T>& args, int32_t from, 
 
 // Row `from`: the pending steps of a row of the table at this step that is behind by explicit_steps or more.
 // Reads the table, explicit_steps and eps of args.
-template <class T>
-struct FinalRules {
+template <class T> struct FinalRules {
   AdamArgs<T> args;
   PendingSteps<T>* rules;  // [n]
   int64_t n;
@@ -204,8 +199,7 @@ BLITZGS_HD T adam_explicit_drift(const AdamArgs<T>& args, const PendingSteps<T>&
 
 // The square root. On CUDA it is exact to an ulp, as the reciprocal: correct rounding would take most of an
 // update's instructions, and the ulp is below the update's own rounding.
-template <class T>
-BLITZGS_HD T adam_root(T x) {
+template <class T> BLITZGS_HD T adam_root(T x) {
 #ifdef __CUDA_ARCH__
   if constexpr (sizeof(T) == 4) {
     asm("sqrt.approx.f32 %0, %0;" : "+f"(x));
@@ -216,8 +210,7 @@ BLITZGS_HD T adam_root(T x) {
 }
 
 // The drift of one element by its group's rule; m and root = sqrt(v) are those at the rule's first step.
-template <class T>
-BLITZGS_HD T adam_ruled_drift(const AdamRule<T>& rule, T m, T root, T eps) {
+template <class T> BLITZGS_HD T adam_ruled_drift(const AdamRule<T>& rule, T m, T root, T eps) {
   const T drift = m * (reciprocal(rule.place[0] * root + eps) * rule.weight[0] +
                        reciprocal(rule.place[1] * root + eps) * rule.weight[1]);
   return m == 0 ? T(0) : drift;
@@ -234,19 +227,16 @@ BLITZGS_HD T adam_drift(const AdamArgs<T>& args, const PendingSteps<T>& steps, i
 
 // Whether the drift of a row on its way to the target is above rounding. `moment_step` is the step of its
 // moments; the drift from explicit_steps after that step on is below rounding.
-template <class T>
-BLITZGS_HD bool adam_moves(const AdamArgs<T>& args, int32_t from, int32_t moment_step) {
+template <class T> BLITZGS_HD bool adam_moves(const AdamArgs<T>& args, int32_t from, int32_t moment_step) {
   return from < args.target() && from - moment_step < args.explicit_steps;
 }
 
-template <class T>
-struct AdamStep {
+template <class T> struct AdamStep {
   T beta1, one_minus_beta1, beta2, one_minus_beta2, inverse_root2, eps;
   T rate[kAdamGroups];  // lr_t b_t
 };
 
-template <class T>
-BLITZGS_HD AdamStep<T> adam_step_scalars(const AdamArgs<T>& args) {
+template <class T> BLITZGS_HD AdamStep<T> adam_step_scalars(const AdamArgs<T>& args) {
   const double* row = args.table_row(args.step);
   AdamStep<T> s;
   s.beta1 = T(args.beta1);
@@ -264,8 +254,7 @@ BLITZGS_HD AdamStep<T> adam_step_scalars(const AdamArgs<T>& args) {
 }
 
 // One Adam step of one element: parameter p, moments m and v, gradient g.
-template <class T>
-BLITZGS_HD void adam_update(const AdamStep<T>& s, int group, T g, T& p, T& m, T& v) {
+template <class T> BLITZGS_HD void adam_update(const AdamStep<T>& s, int group, T g, T& p, T& m, T& v) {
   m = s.beta1 * m + s.one_minus_beta1 * g;
   v = s.beta2 * v + s.one_minus_beta2 * (g * g);
   p -= s.rate[group] * m * reciprocal(adam_root(v) * s.inverse_root2 + s.eps);
@@ -297,8 +286,7 @@ BLITZGS_HD void enter_rate(const RatesArgs& args, int32_t back, int order, doubl
 namespace BLITZGS_BACKEND {
 // With gradients: the listed rows catch up to step - 1 and take the step `step`; parameters and moments are
 // then at `step`. Without (column.grad null), their parameters catch up to `step`.
-template <class T>
-void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream);
+template <class T> void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream);
 }  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -6,8 +6,7 @@
 namespace blitzgs::cpu {
 namespace {
 
-template <class T>
-AdamRowUpdate<T> row_update() {
+template <class T> AdamRowUpdate<T> row_update() {
   if constexpr (std::is_same_v<T, float>) {
     if (use_avx2()) return avx2_adam_row_update();
   }
@@ -17,8 +16,7 @@ AdamRowUpdate<T> row_update() {
 // The rows of a list are scattered in memory, so a row is prefetched while those before are updated.
 constexpr int64_t kPrefetchDistance = 3;
 
-template <class T>
-void prefetch_row(const AdamArgs<T>& args, int64_t row) {
+template <class T> void prefetch_row(const AdamArgs<T>& args, int64_t row) {
   constexpr int64_t kLine = 64 / sizeof(T);
   asm volatile("");  // without this, gcc drops calls of a function that only prefetches
   for (const AdamColumn<T>& column : args.columns) {
@@ -30,8 +28,7 @@ void prefetch_row(const AdamArgs<T>& args, int64_t row) {
 
 // Among rows with pending steps few different values of last_step occur, so each thread computes the rules
 // once for many rows.
-template <class T>
-class PendingStepsCache {
+template <class T> class PendingStepsCache {
  public:
   const PendingSteps<T>& get(const AdamArgs<T>& args, int32_t from, int32_t to) {
     if (args.final_rules && to - from >= args.explicit_steps) return args.final_rules[from];
@@ -51,8 +48,7 @@ class PendingStepsCache {
 
 }  // namespace
 
-template <class T>
-void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream) {
+template <class T> void lazy_adam(const AdamArgs<T>& args, Workspace&, CudaStream) {
   const bool with_gradient = args.with_gradient();
   const AdamStep<T> step = adam_step_scalars(args);
   const AdamRowUpdate<T> update = row_update<T>();

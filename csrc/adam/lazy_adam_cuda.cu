@@ -238,8 +238,7 @@ void check_alignment(const AdamArgs<float>& args) {
 
 }  // namespace
 
-template <class T>
-void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream) {
+template <class T> void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream) {
   static_assert(std::is_same_v<T, float>);
   AdamArgs<float> behind = args;
   behind.step = args.target();

@@ -18,22 +18,19 @@ __device__ inline Decay make_decay(const AdamArgs<float>& args, int32_t steps) {
 }
 
 // Width floats that one instruction loads or stores.
-template <int Width>
-struct alignas(4 * Width) Pack {
+template <int Width> struct alignas(4 * Width) Pack {
   float x[Width];
 };
 
 // The learning-rate group of an element of a pack. In a pack that spans two groups, only the last element is
 // in the second one.
-template <int Column, int Width>
-__device__ constexpr int pack_group(int pack, int element) {
+template <int Column, int Width> __device__ constexpr int pack_group(int pack, int element) {
   return adam_group(Column, pack * Width + (element < Width - 1 ? 0 : element));
 }
 
 // The Adam step of Width elements of a row of a column. load() and finish() are separate, so that a thread
 // can have the loads of several packs in flight.
-template <int Column, int Width>
-class StepPack {
+template <int Column, int Width> class StepPack {
  public:
   using P = Pack<Width>;
 

@@ -66,8 +66,7 @@ struct AdamTensors {
   }
 
   // The kernel's arguments for the rows of a list (`checked_rows`). The caller sets gradients.
-  template <class T>
-  AdamArgs<T> arguments(const OptionalTensor& ids) {
+  template <class T> AdamArgs<T> arguments(const OptionalTensor& ids) {
     AdamArgs<T> args{};
     for (int c = 0; c < count(); ++c) {
       args.columns[first() + c] = {mutable_data<T>(params[c]), mutable_data<T>(exp_avgs[c]),

@@ -10,8 +10,7 @@ namespace blitzgs::cpu {
 template <class T>
 using ExplicitDrift = T (*)(const AdamArgs<T>& args, const PendingSteps<T>& steps, int group, T m, T root);
 
-template <class T>
-struct AdamRowJob {
+template <class T> struct AdamRowJob {
   const AdamArgs<T>& args;
   const AdamStep<T>& step;
   const PendingSteps<T>* steps;  // null unless the row moves (adam_moves)
@@ -20,8 +19,7 @@ struct AdamRowJob {
   const double *to_params, *to_target;  // rows of the table: the decay of the moments up to these steps
 };
 
-template <class T>
-using AdamRowUpdate = void (*)(const AdamRowJob<T>& job);
+template <class T> using AdamRowUpdate = void (*)(const AdamRowJob<T>& job);
 
 // Defined in common/kernels_avx2.cpp; call only where the processor has AVX2 and FMA.
 AdamRowUpdate<float> avx2_adam_row_update();
@@ -29,8 +27,7 @@ AdamRowUpdate<float> avx2_adam_row_update();
 namespace {
 
 // Elements of one learning-rate group, in a row of a column.
-template <class T>
-struct AdamElements {
+template <class T> struct AdamElements {
   T *p, *m, *v;
   const T* g;  // null: the parameters catch up only
   int64_t n;
@@ -38,8 +35,7 @@ struct AdamElements {
 };
 
 // The arithmetic is that of adam_drift().
-template <class T>
-void catch_up(const AdamRowJob<T>& job, const AdamElements<T>& e) {
+template <class T> void catch_up(const AdamRowJob<T>& job, const AdamElements<T>& e) {
   const PendingSteps<T>& steps = *job.steps;
   const AdamRule<T> rule = steps.rules[e.group];
   const T decay1 = T(job.to_params[kBeta1Power]), decay2 = T(job.to_params[kBeta2Power]);
@@ -63,8 +59,7 @@ void catch_up(const AdamRowJob<T>& job, const AdamElements<T>& e) {
 }
 
 // The arithmetic is that of adam_update(), but for one rounding: it divides by the root.
-template <class T>
-void take_step(const AdamRowJob<T>& job, const AdamElements<T>& e) {
+template <class T> void take_step(const AdamRowJob<T>& job, const AdamElements<T>& e) {
   const AdamStep<T>& s = job.step;
   const T decay1 = T(job.to_target[kBeta1Power]), decay2 = T(job.to_target[kBeta2Power]);
   const T rate = s.rate[e.group];
@@ -79,8 +74,7 @@ void take_step(const AdamRowJob<T>& job, const AdamElements<T>& e) {
   }
 }
 
-template <class T>
-void update_row(const AdamRowJob<T>& job) {
+template <class T> void update_row(const AdamRowJob<T>& job) {
   for (int column = 0; column < kAdamColumns; ++column) {
     const AdamColumn<T>& c = job.args.columns[column];
     for (int64_t first = 0, end; first < c.width; first = end) {

@@ -26,8 +26,7 @@ constexpr double kLeastGate = 0x1p-24;
 // The key that makes these draws differ from other draws of the same id and seed.
 constexpr int64_t kPositionNoise = 1;
 
-template <class T>
-struct PositionNoise {
+template <class T> struct PositionNoise {
   T* means;            // [N, 3]
   const T* quats;      // [N, 4]
   const T* scales;     // [N, 3]

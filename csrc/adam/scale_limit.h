@@ -15,8 +15,7 @@
 
 namespace blitzgs {
 
-template <class T>
-struct ScaleLimit {
+template <class T> struct ScaleLimit {
   T* scales;       // [N, 3]
   const T* means;  // [N, 3]
   const int32_t* visible_ids;

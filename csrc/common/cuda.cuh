@@ -62,8 +62,7 @@ inline unsigned resident_blocks(int64_t n, int threads, int resident) {
 }
 
 // Waits for a value in device memory.
-template <class T>
-T read_back(const char* what, const T* value, CudaStream stream) {
+template <class T> T read_back(const char* what, const T* value, CudaStream stream) {
   T found{};
   check(cudaMemcpyAsync(&found, value, sizeof(T), cudaMemcpyDeviceToHost, stream), what);
   check(cudaStreamSynchronize(stream), what);
@@ -71,8 +70,7 @@ T read_back(const char* what, const T* value, CudaStream stream) {
 }
 
 // Calls a function of CUB with scratch memory: run(null, bytes) first sets the bytes that it needs.
-template <class Run>
-void run_cub(const char* what, Workspace& workspace, const Run& run) {
+template <class Run> void run_cub(const char* what, Workspace& workspace, const Run& run) {
   size_t bytes = 0;
   check(run(nullptr, bytes), what);
   check(run(workspace.allocate_bytes(bytes), bytes), what);
@@ -171,8 +169,7 @@ inline void zero(const char* what, int32_t* counters, int64_t n, CudaStream stre
 inline constexpr unsigned kFullWarp = 0xffffffffu;  // the mask of warp functions that all lanes call
 
 // Returns the sum of `value` over the lanes up to and including this one.
-template <class T>
-__device__ __forceinline__ T sum_of_lanes_until(T value, int lane) {
+template <class T> __device__ __forceinline__ T sum_of_lanes_until(T value, int lane) {
 #pragma unroll
   for (int step = 1; step < 32; step *= 2) {
     const T before = __shfl_up_sync(kFullWarp, value, step);
@@ -197,8 +194,7 @@ __device__ __forceinline__ uint32_t transpose_bits(uint32_t bits, int lane) {
 }
 
 // Returns the sum of `value` over a block of THREADS threads on thread 0, and 0 on the others.
-template <int THREADS>
-__device__ double block_sum(double value) {
+template <int THREADS> __device__ double block_sum(double value) {
   __shared__ double warps[THREADS / 32];
   for (int offset = 16; offset > 0; offset /= 2) value += __shfl_down_sync(kFullWarp, value, offset);
   __syncthreads();
@@ -257,8 +253,7 @@ class RunningSum : public SumStates {
   // Publishes the sum `own` of a block and returns the sum over all blocks before it. All threads of the
   // block call this, and each reads the state of one predecessor at a time. It is no barrier for block 0,
   // which has no predecessor, so a caller has a barrier of its own before its next take_turn().
-  template <int kThreads>
-  __device__ int64_t sum_before(int block, int64_t own) const {
+  template <int kThreads> __device__ int64_t sum_before(int block, int64_t own) const {
     __shared__ int64_t parts[kThreads / 32];
     __shared__ bool ends[kThreads / 32];
     const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;

@@ -39,8 +39,7 @@ class Workspace {
   virtual ~Workspace() = default;
   virtual void* allocate_bytes(size_t bytes) = 0;
 
-  template <class T>
-  T* allocate(int64_t count) {
+  template <class T> T* allocate(int64_t count) {
     return static_cast<T*>(allocate_bytes(size_t(count) * sizeof(T)));
   }
 };
@@ -49,8 +48,7 @@ using CudaStream = CUstream_st*;
 
 // Uninitialised arrays of one length in one piece of scratch memory, each aligned for any type: each
 // allocation takes the host microseconds, during which the device waits for the next launch.
-template <class... T>
-std::tuple<T*...> allocate_arrays(int64_t length, Workspace& workspace) {
+template <class... T> std::tuple<T*...> allocate_arrays(int64_t length, Workspace& workspace) {
   constexpr size_t kAlignment = 256;
   const auto bytes = [&](size_t size) {
     return (size_t(length) * size + kAlignment - 1) / kAlignment * kAlignment;
@@ -75,8 +73,7 @@ BLITZGS_HD int64_t valid_splat_count(int64_t n_splats, const int64_t* known) {
   return 0 <= count && count <= n_splats ? count : 0;
 }
 
-template <class Input>
-BLITZGS_HD int64_t valid_splat_count(const Input& in) {
+template <class Input> BLITZGS_HD int64_t valid_splat_count(const Input& in) {
   return valid_splat_count(in.n_splats, in.known_splats);
 }
 

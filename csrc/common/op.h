@@ -44,8 +44,7 @@ using TensorList = std::vector<Tensor>;
 using IntList = std::vector<int64_t>;
 using FloatList = std::vector<double>;
 // The N results of an op.
-template <size_t N>
-using Tensors = decltype(std::tuple_cat(std::array<Tensor, N>()));
+template <size_t N> using Tensors = decltype(std::tuple_cat(std::array<Tensor, N>()));
 
 inline std::string shape_of(const Tensor& tensor) {
   std::ostringstream text;
@@ -67,8 +66,7 @@ struct CheckFailed : std::runtime_error {
   using std::runtime_error::runtime_error;
 };
 
-template <typename... Parts>
-[[noreturn]] void fail(const Parts&... parts) {
+template <typename... Parts> [[noreturn]] void fail(const Parts&... parts) {
   std::ostringstream text;
   (text << ... << parts);
   throw CheckFailed(text.str());
@@ -81,8 +79,7 @@ template <typename... Parts>
       ::blitzgs::fail(__VA_ARGS__);   \
   } while (false)
 
-template <size_t Length>
-struct OpName {
+template <size_t Length> struct OpName {
   char text[Length];
   constexpr OpName(const char (&name)[Length]) { std::copy_n(name, Length, text); }
 };
@@ -115,8 +112,7 @@ inline void check_shape(const char* name, const Tensor& tensor, std::initializer
 }
 
 // Checks the number of entries of a group of arguments, whose `names` are for the message.
-template <class List>
-void check_group(const char* names, const List& list, size_t least, size_t most) {
+template <class List> void check_group(const char* names, const List& list, size_t least, size_t most) {
   BLITZGS_CHECK(list.size() >= least && list.size() <= most, "expected ", names, ", got ", list.size(),
                 " entries");
 }
@@ -173,22 +169,18 @@ inline OptionalTensor checked(const char* name, const OptionalTensor& tensor, Sc
   return tensor ? std::optional(checked(name, *tensor, dtype, shape)) : std::nullopt;
 }
 
-template <class T>
-const T* data(const Tensor& tensor) {
+template <class T> const T* data(const Tensor& tensor) {
   return static_cast<const T*>(tensor.const_data_ptr());
 }
-template <class T>
-T* mutable_data(const Tensor& tensor) {
+template <class T> T* mutable_data(const Tensor& tensor) {
   return static_cast<T*>(tensor.mutable_data_ptr());
 }
-template <class T>
-const T* data_or_null(const OptionalTensor& tensor) {
+template <class T> const T* data_or_null(const OptionalTensor& tensor) {
   return tensor ? static_cast<const T*>(tensor->const_data_ptr()) : nullptr;
 }
 
 // A tensor whose values are of type T, and which converts to their address. const T: they are only read.
-template <class T>
-struct Values : Tensor {
+template <class T> struct Values : Tensor {
   explicit Values(const Tensor& tensor) : Tensor(tensor) {}
   T* data() const {
     if constexpr (std::is_const_v<T>) return static_cast<T*>(const_data_ptr());
@@ -198,13 +190,11 @@ struct Values : Tensor {
   operator T*() const { return data(); }
 };
 
-template <class T>
-struct OptionalValues : std::optional<Values<T>> {
+template <class T> struct OptionalValues : std::optional<Values<T>> {
   operator T*() const { return this->has_value() ? (*this)->data() : nullptr; }
 };
 
-template <class T>
-using dtype_of = torch::headeronly::CppTypeToScalarType<T>;
+template <class T> using dtype_of = torch::headeronly::CppTypeToScalarType<T>;
 
 template <class T>
 Values<const T> checked(const char* name, const Tensor& tensor, std::initializer_list<int64_t> shape) {
@@ -241,8 +231,7 @@ inline Tensor make_empty(const Tensor& like, const IntList& shape,
   return Tensor(handle);
 }
 
-template <class T>
-Values<T> make(const Tensor& like, const IntList& shape) {
+template <class T> Values<T> make(const Tensor& like, const IntList& shape) {
   return Values<T>(make_empty(like, shape, dtype_of<T>::value));
 }
 
@@ -305,15 +294,13 @@ struct DeviceScope {
 };
 
 // for_each_row() on the device and stream of `like`.
-template <class Rows>
-void run_rows(const Tensor& like, const Rows& work) {
+template <class Rows> void run_rows(const Tensor& like, const Rows& work) {
   DeviceScope scope(like);
   backend::for_each_row(work, scope.stream);
 }
 
 // Returns f<T>() with T = float or double by the tensor's dtype (CUDA: float only).
-template <class F>
-auto dispatch_floating([[maybe_unused]] const Tensor& tensor, const F& f) {
+template <class F> auto dispatch_floating([[maybe_unused]] const Tensor& tensor, const F& f) {
 #ifndef BLITZGS_BACKEND_CUDA
   if (tensor.scalar_type() == ScalarType::Double) return f.template operator()<double>();
 #endif

@@ -35,8 +35,7 @@ static __global__ void __launch_bounds__(kRowThreads) row_kernel(const __grid_co
   if (i < work.n) work(i);
 }
 
-template <class Rows>
-void for_each_row(const Rows& work, CudaStream stream) {
+template <class Rows> void for_each_row(const Rows& work, CudaStream stream) {
   if (work.n == 0) return;
   launch_early("rows", row_kernel<Rows>, {blocks_for(work.n, kRowThreads), kRowThreads, stream}, work);
 }

@@ -57,8 +57,7 @@ void gather(const int32_t* packed, const SplatGroups& groups, const SplatColumns
   }
 }
 
-template <class T>
-void sum(const SplatValues<T>& in, const SplatColumns<T>& out, CudaStream) {
+template <class T> void sum(const SplatValues<T>& in, const SplatColumns<T>& out, CudaStream) {
   for (int c = 0; c < out.count; ++c) {
     std::fill_n(out.data[c], in.count * (out.begin[c + 1] - out.begin[c]), T(0));
   }

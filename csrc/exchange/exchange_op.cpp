@@ -28,8 +28,7 @@ int64_t total_splats(const SplatGroups& groups) {
   return groups.start[groups.count - 1] + groups.size[groups.count - 1];
 }
 
-template <class Word>
-void add_column(SplatColumns<Word>& columns, Word* data, int64_t width) {
+template <class Word> void add_column(SplatColumns<Word>& columns, Word* data, int64_t width) {
   BLITZGS_CHECK(columns.count < kMaxSplatColumns, "at most ", kMaxSplatColumns, " columns");
   const int64_t end = columns.begin[columns.count] + width;
   BLITZGS_CHECK(width >= 0 && end <= 4096, "a splat may have 4096 words, got ", end);

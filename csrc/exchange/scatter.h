@@ -54,8 +54,7 @@ BLITZGS_HD int lowest_bit(uint64_t bits) {
 
 // The columns of some splats. begin: the offset of each column in a splat, in words; the last entry is the
 // number of words in a splat.
-template <class Word>
-struct SplatColumns {
+template <class Word> struct SplatColumns {
   Word* data[kMaxSplatColumns];
   int begin[kMaxSplatColumns + 1];
   int count;
@@ -78,8 +77,7 @@ struct ScatterSplats {
 };
 
 // Values of the splats that went to each rank: `size` rows of `width` values.
-template <class T>
-struct SplatValues {
+template <class T> struct SplatValues {
   const T* values[kMaxRanks];
   int64_t size[kMaxRanks];
   int n_ranks, width;
@@ -87,8 +85,7 @@ struct SplatValues {
   const SplatPlace* places;  // where in each rank's rows they are
 
   // Calls f(pointer to the splat's values from a rank) for each rank that the splat went to, in order.
-  template <class F>
-  BLITZGS_HD void for_each(uint64_t splat, const F& f) const {
+  template <class F> BLITZGS_HD void for_each(uint64_t splat, const F& f) const {
     const SplatPlace* run = places + splat / kPlaceSplats * n_ranks;
     const auto in_run = uint32_t(splat % kPlaceSplats);
     uint64_t ranks = 0;
@@ -109,8 +106,7 @@ namespace BLITZGS_BACKEND {
 void scatter(const ScatterSplats&, const SplatGroups&, const ScatterTargets&, SplatPlace* places, Workspace&,
              CudaStream);
 void gather(const int32_t* packed, const SplatGroups&, const SplatColumns<int32_t>&, CudaStream);
-template <class T>
-void sum(const SplatValues<T>&, const SplatColumns<T>&, CudaStream);
+template <class T> void sum(const SplatValues<T>&, const SplatColumns<T>&, CudaStream);
 }  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

@@ -175,8 +175,7 @@ void gather(const int32_t* packed, const SplatGroups& groups, const SplatColumns
   check_launch("gather_splats");
 }
 
-template <>
-void sum<float>(const SplatValues<float>& in, const SplatColumns<float>& out, CudaStream stream) {
+template <> void sum<float>(const SplatValues<float>& in, const SplatColumns<float>& out, CudaStream stream) {
   if (in.count == 0 || in.width == 0) return;
   if (are_gradients(in, out)) {
     sum_gradients_kernel<<<blocks_for(in.count, kGradientSplats), kGradientPieces * kGradientSplats, 0,

@@ -38,8 +38,7 @@ struct __align__(8) TileSum {
 __device__ __forceinline__ TileSum* sums_of(Entry& entry) { return reinterpret_cast<TileSum*>(entry.color); }
 
 // Replaces copy_color(): an entry gets no colour. Its sums begin at zero.
-template <bool kSquares>
-struct NoColors {};
+template <bool kSquares> struct NoColors {};
 template <bool kSquares>
 __device__ __forceinline__ void copy_color(float* shared, NoColors<kSquares>, int32_t) {
   using Sums = std::conditional_t<kSquares, uint4, uint2>;
@@ -78,8 +77,7 @@ __device__ __forceinline__ uint32_t one_if_any(uint32_t units) {
 
 // Sums an entry's weights, and with kSquares their squares, over the 16 pixels of a subtile, and adds the
 // sums to those of the entry.
-template <bool kSquares>
-__device__ __forceinline__ void sum_pixels(const uint32_t* words, Entry& entry) {
+template <bool kSquares> __device__ __forceinline__ void sum_pixels(const uint32_t* words, Entry& entry) {
   uint64_t weight = 0, squares = 0;
   uint32_t pixels = 0;
 #pragma unroll

@@ -137,8 +137,7 @@ struct DepthRange {
   uint32_t low, high;
 
   // Returns the union of the ranges of all threads of a block to each thread. All threads call this.
-  template <int kThreads>
-  __device__ DepthRange over_block() const {
+  template <int kThreads> __device__ DepthRange over_block() const {
     __shared__ DepthRange warps[kThreads / 32];
     const int lane = threadIdx.x % 32;
     DepthRange range{__reduce_min_sync(kFullWarp, low), __reduce_max_sync(kFullWarp, high)};

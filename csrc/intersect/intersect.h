@@ -26,8 +26,7 @@
 
 namespace blitzgs {
 
-template <class T>
-struct IntersectInput {
+template <class T> struct IntersectInput {
   const T *means2d, *conics, *opacities, *depths;
   const int32_t* camera_ids;
   const int64_t* ids;
@@ -38,8 +37,7 @@ struct IntersectInput {
 
 namespace BLITZGS_BACKEND {
 // On CUDA it waits for the device, because the host needs the count.
-template <class T>
-int64_t count_intersections(const IntersectInput<T>& in, Workspace&, CudaStream);
+template <class T> int64_t count_intersections(const IntersectInput<T>& in, Workspace&, CudaStream);
 // On CUDA it does not wait for the device, and returns the capacity.
 template <class T>
 int64_t intersect(const IntersectInput<T>& in, int64_t capacity, int32_t* isect_splats, int64_t* tile_offsets,

@@ -15,17 +15,14 @@ struct Span {
   int64_t first;
 };
 
-template <class T>
-using KeyOf = decltype(ordered_bits(T()));
+template <class T> using KeyOf = decltype(ordered_bits(T()));
 
-template <class Key>
-struct Keyed {
+template <class Key> struct Keyed {
   Key key;
   int32_t splat;
 };
 
-template <class T, class F>
-void for_each_span(const IntersectInput<T>& in, int32_t splat, const F& f) {
+template <class T, class F> void for_each_span(const IntersectInput<T>& in, int32_t splat, const F& f) {
   const TileGrid& grid = in.grid;
   const int64_t image = in.camera_ids[splat] * grid.per_image();
   for_each_tile_row(in.means2d + 2 * int64_t(splat), in.conics + 3 * int64_t(splat), in.opacities[splat],
@@ -38,15 +35,13 @@ void for_each_span(const IntersectInput<T>& in, int32_t splat, const F& f) {
 }
 
 // Calls f(piece, begin, end) for [0, n) in `pieces` pieces of nearly equal length.
-template <class F>
-void parallel_pieces(int64_t n, int pieces, const F& f) {
+template <class F> void parallel_pieces(int64_t n, int pieces, const F& f) {
   parallel_rows(pieces, 1,
                 [&](int64_t piece) { f(int(piece), n * piece / pieces, n * (piece + 1) / pieces); });
 }
 
 // One stable counting pass on 11 bits. Returns false and moves nothing when all keys have the same 11 bits.
-template <class Key>
-bool radix_pass(const Keyed<Key>* from, Keyed<Key>* to, int64_t n, int shift) {
+template <class Key> bool radix_pass(const Keyed<Key>* from, Keyed<Key>* to, int64_t n, int shift) {
   constexpr int kBuckets = 1 << 11;
   const int pieces = num_threads();
   const auto bucket_of = [shift](Key key) { return int(key >> shift) & (kBuckets - 1); };
@@ -72,8 +67,7 @@ bool radix_pass(const Keyed<Key>* from, Keyed<Key>* to, int64_t n, int shift) {
 }
 
 // Orders each run of splats with equal depths by id. The stable sort left them in splat order.
-template <class Key>
-void order_ties(Keyed<Key>* splats, int64_t n, const int64_t* ids) {
+template <class Key> void order_ties(Keyed<Key>* splats, int64_t n, const int64_t* ids) {
   for (int64_t begin = 0; begin < n;) {
     int64_t end = begin + 1;
     while (end < n && splats[end].key == splats[begin].key) ++end;
@@ -87,8 +81,7 @@ void order_ties(Keyed<Key>* splats, int64_t n, const int64_t* ids) {
 }
 
 // Returns the splats of all cameras sorted by (depth, id), the order of compositing.
-template <class T>
-const Keyed<KeyOf<T>>* sort_splats(const IntersectInput<T>& in, Workspace& workspace) {
+template <class T> const Keyed<KeyOf<T>>* sort_splats(const IntersectInput<T>& in, Workspace& workspace) {
   using Key = KeyOf<T>;
   auto* splats = workspace.allocate<Keyed<Key>>(in.n_splats);
   auto* spare = workspace.allocate<Keyed<Key>>(in.n_splats);
@@ -109,8 +102,7 @@ int choose_pieces(int64_t n_tiles) {
 
 }  // namespace
 
-template <class T>
-int64_t count_intersections(const IntersectInput<T>& in, Workspace&, CudaStream) {
+template <class T> int64_t count_intersections(const IntersectInput<T>& in, Workspace&, CudaStream) {
   std::atomic<int64_t> total{0};
   parallel_for(0, in.n_splats, 1 << 12, [&](int64_t begin, int64_t end) {
     int64_t count = 0;

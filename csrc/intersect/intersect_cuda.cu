@@ -61,8 +61,7 @@ struct LaneEntry {
 
 // Numbers the entries of a warp's lanes, `count` of each lane, one lane after the other, and shares them out
 // evenly: calls f(LaneEntry) for 32 entries at a time, on all lanes. Returns the number of entries.
-template <class F>
-__device__ __forceinline__ int32_t share_entries(int32_t count, int lane, const F& f) {
+template <class F> __device__ __forceinline__ int32_t share_entries(int32_t count, int lane, const F& f) {
   const int32_t until = sum_of_lanes_until(count, lane), total = __shfl_sync(kFullWarp, until, 31);
   const int32_t begin = until - count;
   for (int32_t first = 0; first < total; first += 32) {
@@ -78,8 +77,7 @@ __device__ __forceinline__ int32_t share_entries(int32_t count, int lane, const 
 }
 
 // The list entries in the order of the splats: the tile (keys) and the splat of each, [capacity].
-template <class Key>
-struct Entries {
+template <class Key> struct Entries {
   int64_t capacity;
   Key* keys;
   int32_t* splats;
@@ -225,8 +223,7 @@ __global__ void tile_offsets_kernel(const Key* keys, const int64_t* n_entries, T
 }
 
 // The scratch memory of a call, except for the arrays of splats and entries.
-template <class State>
-struct Counters {
+template <class State> struct Counters {
   unsigned depth_blocks, tile_blocks, emit_blocks;
   // range_kernel sets all of these to zero, except for the ranges, which it writes.
   uint64_t *depth_histograms, *tile_histograms, *running, *turns;
@@ -342,8 +339,7 @@ void list_splats(const Input& in, int64_t capacity, int32_t* isect_splats, int64
 
 }  // namespace
 
-template <>
-int64_t count_intersections<float>(const Input& in, Workspace& workspace, CudaStream stream) {
+template <> int64_t count_intersections<float>(const Input& in, Workspace& workspace, CudaStream stream) {
   if (in.n_splats == 0 || in.grid.tile_end <= in.grid.tile_begin) return 0;
   auto* counts = workspace.allocate<int32_t>(in.n_splats);
   auto* total = workspace.allocate<int64_t>(1);

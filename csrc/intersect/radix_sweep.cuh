@@ -14,8 +14,7 @@ inline constexpr int kSweepWindow = 4;  // predecessors whose states are read at
 
 // State: an unsigned integer. The two high bits say what the other bits count (sweep_kernel), so 32-bit
 // states need n_items < kSmallStates.
-template <class Key, class State>
-struct SweepPass {
+template <class Key, class State> struct SweepPass {
   const Key* keys;
   const int32_t* values;  // null: the positions of the keys
   Key* sorted_keys;
@@ -64,8 +63,7 @@ __device__ __forceinline__ State count_before(const State* states, unsigned bloc
 
 // Returns the lanes whose values have the same low bits as this lane's. It is written in PTX because the
 // compiler spends 7 instructions on each bit.
-template <int kBits>
-__device__ __forceinline__ unsigned lanes_with_same(unsigned value) {
+template <int kBits> __device__ __forceinline__ unsigned lanes_with_same(unsigned value) {
   unsigned lanes = kFullWarp;
 #pragma unroll
   for (int bit = 0; bit < kBits; ++bit) {

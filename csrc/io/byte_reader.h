@@ -38,8 +38,7 @@ class ByteReader {
   uint64_t remaining() const { return size_ - offset_; }
 
   // Reads a value of fixed size; `what` names it in the message if the file ends first.
-  template <class T>
-  T read(const char* what) {
+  template <class T> T read(const char* what) {
     static_assert(std::is_trivially_copyable_v<T>);
     T value;
     read_bytes(&value, sizeof value, what);
@@ -75,8 +74,7 @@ class ByteReader {
 // Reads all of `text` as a number; false if it is none. A sign + is allowed, which std::from_chars refuses. A
 // real number beyond the range of T becomes zero or infinity with its sign, as it does in other readers; an
 // integer beyond it is refused.
-template <class T>
-bool parse_number(std::string_view text, T& value) {
+template <class T> bool parse_number(std::string_view text, T& value) {
   if (text.starts_with('+')) {
     text.remove_prefix(1);
     if (text.starts_with('-')) return false;
@@ -115,8 +113,7 @@ class TextReader {
   bool has_token();
   std::string_view rest();
 
-  template <class T>
-  T number(const char* what) {
+  template <class T> T number(const char* what) {
     const std::string_view text = token(what);
     T value{};
     if (!parse_number(text, value)) fail("'" + std::string(text.substr(0, 40)) + "' is not a valid " + what);

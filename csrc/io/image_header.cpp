@@ -79,8 +79,7 @@ ImageHeader read_png(ImageBytes file, const std::string& name) {
 
 // Calls `visit(kind, payload)` for the boxes of a JPEG 2000, HEIF or AVIF file or of one of their boxes. The
 // last one may be cut off: the codestream is not needed.
-template <class Visit>
-void each_box(ImageBytes bytes, Visit visit) {
+template <class Visit> void each_box(ImageBytes bytes, Visit visit) {
   while (bytes.size() >= 8) {
     uint64_t length = big_endian(bytes, 0, 4), header = 8;
     if (length == 1 && bytes.size() >= 16) {

@@ -15,8 +15,7 @@ using Bytes = std::vector<uint8_t>;
 void append(Bytes& out, const Bytes& more) { out.insert(out.end(), more.begin(), more.end()); }
 
 // The reason that a reader gives for refusing a file, or an empty string.
-template <class F>
-std::string refusal(const F& read, const Bytes& file) {
+template <class F> std::string refusal(const F& read, const Bytes& file) {
   try {
     read(file);
     return "";

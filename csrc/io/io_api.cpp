@@ -67,8 +67,7 @@ namespace {
 namespace io = blitzgs::io;
 using Bytes = std::span<const uint8_t>;
 
-template <class T>
-constexpr int32_t type_of() {
+template <class T> constexpr int32_t type_of() {
   if constexpr (std::is_same_v<T, uint8_t>) return BLITZGS_IO_UINT8;
   if constexpr (std::is_same_v<T, uint32_t>) return BLITZGS_IO_UINT32;
   if constexpr (std::is_same_v<T, int64_t>) return BLITZGS_IO_INT64;
@@ -80,17 +79,13 @@ class Arguments {
  public:
   explicit Arguments(std::span<const blitzgs_io_column> columns) : columns_(columns) {}
 
-  template <class T>
-  std::span<const T> take() {
+  template <class T> std::span<const T> take() {
     if (next_ == columns_.size()) throw std::logic_error("an argument is missing");
     const blitzgs_io_column& column = columns_[next_++];
     if (column.type != type_of<T>()) throw std::logic_error("an argument has another type");
     return {static_cast<const T*>(column.data), column.size};
   }
-  template <class T = uint64_t>
-  T number() {
-    return take<T>()[0];
-  }
+  template <class T = uint64_t> T number() { return take<T>()[0]; }
   std::string text() {
     const Bytes bytes = take<uint8_t>();
     return {bytes.begin(), bytes.end()};
@@ -109,8 +104,7 @@ struct blitzgs_io_reply {
   std::vector<blitzgs_io_column> columns;
   std::vector<std::shared_ptr<const void>> held;
 
-  template <class... T>
-  void add(std::vector<T>&&... values) {
+  template <class... T> void add(std::vector<T>&&... values) {
     const auto add_one = [&]<class V>(std::vector<V>&& one) {
       const auto owner = std::make_shared<const std::vector<V>>(std::move(one));
       columns.push_back({owner->data(), owner->size(), type_of<V>()});
@@ -118,13 +112,9 @@ struct blitzgs_io_reply {
     };
     (add_one(std::move(values)), ...);
   }
-  template <class T = uint64_t>
-  void add_number(T value) {
-    add(std::vector<T>{value});
-  }
+  template <class T = uint64_t> void add_number(T value) { add(std::vector<T>{value}); }
   void add_text(std::string_view text) { add(std::vector<uint8_t>(text.begin(), text.end())); }
-  template <class Texts>
-  void add_texts(const Texts& texts) {
+  template <class Texts> void add_texts(const Texts& texts) {
     std::vector<uint8_t> bytes;
     std::vector<uint64_t> ends;
     for (const std::string_view text : texts) {

@@ -26,8 +26,7 @@ std::string read_token(ByteReader& reader) {
   return token;
 }
 
-template <class T>
-void parse_value(ByteReader& reader, uint8_t* out) {
+template <class T> void parse_value(ByteReader& reader, uint8_t* out) {
   const std::string token = read_token(reader);
   T value{};
   if (!parse_number(token, value)) reader.fail("'" + token.substr(0, 40) + "' is not a valid value");

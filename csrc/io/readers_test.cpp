@@ -16,8 +16,7 @@ namespace {
 
 using Reader = std::function<void(std::istream&)>;
 // The bytes of values, one after the other; a text ends with a NUL.
-template <class... T>
-std::string bytes_of(const T&... values) {
+template <class... T> std::string bytes_of(const T&... values) {
   std::string out;
   const auto add = [&]<class V>(const V& value) {
     if constexpr (std::is_convertible_v<V, std::string>) {
@@ -135,8 +134,7 @@ TEST_CASE("an image in the place of observations is refused, whether these are r
 
 namespace {
 
-template <class T>
-std::optional<T> parsed(std::string_view text) {
+template <class T> std::optional<T> parsed(std::string_view text) {
   T value{};
   return parse_number(text, value) ? std::optional<T>(value) : std::nullopt;
 }

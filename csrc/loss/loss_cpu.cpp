@@ -22,13 +22,11 @@ void run_strips(const PhotometricArgs<T>& args, const int64_t* strips, int64_t b
 
 }  // namespace
 
-template <class T>
-int64_t photometric_parts(const PhotometricArgs<T>& args) {
+template <class T> int64_t photometric_parts(const PhotometricArgs<T>& args) {
   return (args.height + kStripRows - 1) / kStripRows;
 }
 
-template <class T>
-void photometric(const PhotometricArgs<T>& args, Workspace& workspace, CudaStream) {
+template <class T> void photometric(const PhotometricArgs<T>& args, Workspace& workspace, CudaStream) {
   const int64_t per_view = photometric_parts(args);
   const int64_t total = args.views * per_view;
   const int64_t view_tiles = int64_t{args.tiles_x} * args.tiles_y;
@@ -58,8 +56,7 @@ void photometric(const PhotometricArgs<T>& args, Workspace& workspace, CudaStrea
 BLITZGS_FOR_BOTH_DTYPES(photometric_parts);
 BLITZGS_FOR_BOTH_DTYPES(photometric);
 
-template <class T>
-void report(const Report<T>& report, CudaStream) {
+template <class T> void report(const Report<T>& report, CudaStream) {
   for (int64_t view = 0; view < report.views; ++view) {
     const double* parts = report.parts + 2 * view * report.n_parts;
     double l1 = 0, ssim = 0;
@@ -78,8 +75,7 @@ void report(const Report<T>& report, CudaStream) {
 
 BLITZGS_FOR_BOTH_DTYPES(report);
 
-template <class T>
-void loss_of_sums(const LossOfSums<T>& args, CudaStream) {
+template <class T> void loss_of_sums(const LossOfSums<T>& args, CudaStream) {
   double l1 = 0, ssim = 0;
   for (int64_t i = 0; i < args.n; ++i) l1 += args.parts[2 * i], ssim += args.parts[2 * i + 1];
   *args.loss = T(args.offset + args.l1_weight * l1 + args.ssim_weight * ssim);

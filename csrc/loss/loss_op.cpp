@@ -6,8 +6,7 @@
 namespace blitzgs {
 namespace {
 
-template <class T>
-void fill_window(T (&window)[kSsimTaps]) {
+template <class T> void fill_window(T (&window)[kSsimTaps]) {
   double values[kSsimTaps], total = 0;
   for (int i = 0; i < kSsimTaps; ++i) {
     values[i] = std::exp(-(i - kSsimRadius) * (i - kSsimRadius) / (2 * 1.5 * 1.5));

@@ -33,15 +33,13 @@ constexpr int kSsimTaps = 2 * kSsimRadius + 1;
 
 // Terms of the training loss that are means over the visible Gaussians of a view. One of n visible Gaussians
 // weighs scale_reg = scale_weight / n and opacity_reg = opacity_weight / (B n); n is at least 1.
-template <class T>
-struct MeanTerms {
+template <class T> struct MeanTerms {
   const int64_t* visible;  // [B]; null: no such terms
   T scale_weight, opacity_weight;
   T *scale_reg, *opacity_reg;  // [B]
 };
 
-template <class T>
-struct PhotometricArgs {
+template <class T> struct PhotometricArgs {
   const T* renders;
   const T* targets;  // null if the targets are uint8
   const uint8_t* targets_u8;
@@ -76,13 +74,11 @@ BLITZGS_HD OwnedColumns owned_columns(const PhotometricArgs<T>& args, int64_t vi
 }
 
 // The weight of a view: an entry of l1_weights or ssim_weights, divided by the view's samples.
-template <class T>
-BLITZGS_HD T weight_of(const PhotometricArgs<T>& args, const T* weights, int64_t view) {
+template <class T> BLITZGS_HD T weight_of(const PhotometricArgs<T>& args, const T* weights, int64_t view) {
   return args.samples ? weights[view] / args.samples[view] : weights[view];
 }
 
-template <class T>
-BLITZGS_HD void write_mean_terms(const MeanTerms<T>& means, int64_t views, int64_t view) {
+template <class T> BLITZGS_HD void write_mean_terms(const MeanTerms<T>& means, int64_t views, int64_t view) {
   const int64_t n = means.visible[view] > 1 ? means.visible[view] : 1;
   means.scale_reg[view] = means.scale_weight / T(n);
   // Rounded as torch rounds a number divided by a tensor, so that trainings repeat those of earlier versions.
@@ -90,13 +86,11 @@ BLITZGS_HD void write_mean_terms(const MeanTerms<T>& means, int64_t views, int64
 }
 
 // One window: its SSIM and the derivatives by mean(x), P and Q.
-template <class T>
-struct SsimTerms {
+template <class T> struct SsimTerms {
   T value, by_mean, by_p, by_q;
 };
 
-template <class T>
-BLITZGS_HD SsimTerms<T> ssim_terms(T mean_x, T e, T p, T q) {
+template <class T> BLITZGS_HD SsimTerms<T> ssim_terms(T mean_x, T e, T p, T q) {
   const T c1 = T(0.0001), c2 = T(0.0009);
   const T mean_y = mean_x - e;
   const T energy = mean_x * mean_x + mean_y * mean_y;
@@ -119,15 +113,13 @@ BLITZGS_HD SsimTerms<T> ssim_terms(T mean_x, T e, T p, T q) {
 constexpr int kMaxReportTargets = 16;
 
 // The memory of one rank that gets the report, a peer's or this rank's own.
-template <class T>
-struct ReportTarget {
+template <class T> struct ReportTarget {
   T* l1;     // [B]
   T* ssim;   // [B]
   T* tiles;  // [tiles], of which this rank's are written
 };
 
-template <class T>
-struct Report {
+template <class T> struct Report {
   const double* parts;  // [B, K, 2]
   int64_t views, n_parts;
   const int32_t* tile_work;  // [tiles]
@@ -140,8 +132,7 @@ struct Report {
 //   loss = offset + sum over i of (l1_weight parts[i][0] + ssim_weight parts[i][1]),  0 <= i < n.
 // Parts are added in a fixed order. CPU and CUDA agree to the rounding of doubles.
 
-template <class T>
-struct LossOfSums {
+template <class T> struct LossOfSums {
   const double* parts;
   int64_t n;
   double l1_weight, ssim_weight, offset;
@@ -149,14 +140,10 @@ struct LossOfSums {
 };
 
 namespace BLITZGS_BACKEND {
-template <class T>
-int64_t photometric_parts(const PhotometricArgs<T>& args);
-template <class T>
-void photometric(const PhotometricArgs<T>& args, Workspace&, CudaStream);
-template <class T>
-void loss_of_sums(const LossOfSums<T>&, CudaStream);
-template <class T>
-void report(const Report<T>& report, CudaStream);
+template <class T> int64_t photometric_parts(const PhotometricArgs<T>& args);
+template <class T> void photometric(const PhotometricArgs<T>& args, Workspace&, CudaStream);
+template <class T> void loss_of_sums(const LossOfSums<T>&, CudaStream);
+template <class T> void report(const Report<T>& report, CudaStream);
 }  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

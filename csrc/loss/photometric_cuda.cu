@@ -30,16 +30,14 @@ struct Shared {
 
 // kLead: how many rows above its first row a strip starts to read. kWindowRound: the round of its first
 // windows. They are chosen such that sums are added in the same order with and without a gradient.
-template <bool kGradient>
-constexpr int kLead = kGradient ? 2 * kSsimRadius : kSsimRadius + 1;
+template <bool kGradient> constexpr int kLead = kGradient ? 2 * kSsimRadius : kSsimRadius + 1;
 constexpr int kWindowRound = 2;
 constexpr int kOutRound = 5;
 static_assert(kRows * kOutRound == 4 * kSsimRadius);
 
 // One block's work on its strip. Steps 2 and 5 have two forms. The plain form is for rounds whose rows are
 // all inside the image and owned as a whole, without a mask; nearly all rounds are of this kind.
-template <bool kBytes, bool kGradient, bool kSums>
-class StripWalk {
+template <bool kBytes, bool kGradient, bool kSums> class StripWalk {
  public:
   __device__ __forceinline__ StripWalk(const PhotometricArgs<float>& args, const Launch& launch,
                                        Shared* shared)
@@ -162,8 +160,7 @@ class StripWalk {
   }
 
   // Step 2: the windows that are centred on the rows of the round from `top` on.
-  template <bool kPlain>
-  __device__ __forceinline__ void windows(Shared& shared, int top) {
+  template <bool kPlain> __device__ __forceinline__ void windows(Shared& shared, int top) {
     if (threadIdx.x >= kRows * 3 * kMidGroups) return;
     const Item item = item_of<kMidGroups>(threadIdx.x);
     float sums[4][4];
@@ -224,8 +221,7 @@ class StripWalk {
   }
 
   // Step 5: writes the gradient of the rows of the round from `top` on.
-  template <bool kPlain>
-  __device__ __forceinline__ void write_gradient(const Shared& shared, int top) {
+  template <bool kPlain> __device__ __forceinline__ void write_gradient(const Shared& shared, int top) {
     if (local_ >= width_) return;
     float x[kRows];
     Target<kBytes> y[kRows];
@@ -358,13 +354,11 @@ void clear_rest(const PhotometricArgs<float>& args, const Launch& launch, cudaSt
 
 }  // namespace
 
-template <class T>
-int64_t photometric_parts(const PhotometricArgs<T>& args) {
+template <class T> int64_t photometric_parts(const PhotometricArgs<T>& args) {
   return int64_t{cut_strips(args).view_strips} * block_columns(args);
 }
 
-template <class T>
-void photometric(const PhotometricArgs<T>& args, Workspace&, CudaStream stream) {
+template <class T> void photometric(const PhotometricArgs<T>& args, Workspace&, CudaStream stream) {
   const Launch launch = cut_strips(args);
   const dim3 grid(block_columns(args), std::max(launch.strips, 1));
   args.targets_u8 ? launch_strips<true>(grid, args, launch, stream)

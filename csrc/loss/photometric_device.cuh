@@ -73,8 +73,7 @@ __device__ inline bool owns_pixel(const PhotometricArgs<float>& args, int view, 
 
 // Targets keep the type in which they were loaded until they are used, because a conversion right after the
 // load would wait for the load.
-template <bool kBytes>
-using Target = std::conditional_t<kBytes, uint8_t, float>;
+template <bool kBytes> using Target = std::conditional_t<kBytes, uint8_t, float>;
 
 template <bool kBytes>
 __device__ __forceinline__ const Target<kBytes>* targets_of(const PhotometricArgs<float>& args) {
@@ -128,8 +127,7 @@ __device__ __forceinline__ void convolve4(const float (&window)[kSsimTaps], cons
 struct Item {
   int row, channel, pixel;
 };
-template <int kGroups>
-__device__ __forceinline__ Item item_of(int thread) {
+template <int kGroups> __device__ __forceinline__ Item item_of(int thread) {
   const int row = thread / (3 * kGroups), rest = thread - row * 3 * kGroups;
   return {row, rest / kGroups, 4 * (rest % kGroups)};
 }

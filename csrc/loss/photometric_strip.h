@@ -22,8 +22,7 @@ namespace {
 constexpr int kPad = 3 * kSsimRadius;
 
 // out [count] = the horizontal convolution of a row that is padded by kPad zeros on both sides.
-template <class T>
-void convolve_row(const T* window, const T* padded, int64_t count, T* out) {
+template <class T> void convolve_row(const T* window, const T* padded, int64_t count, T* out) {
 #pragma GCC ivdep
   for (int64_t i = 0; i < count; ++i) {
     const T* in = padded + i;
@@ -37,8 +36,7 @@ void convolve_row(const T* window, const T* padded, int64_t count, T* out) {
   }
 }
 
-template <class T>
-class PhotometricStrip {
+template <class T> class PhotometricStrip {
  public:
   explicit PhotometricStrip(const PhotometricArgs<T>& args)
       : args_(args),

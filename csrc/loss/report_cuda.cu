@@ -47,8 +47,7 @@ __global__ void __launch_bounds__(kLossThreads) loss_of_sums_kernel(const LossOf
 
 }  // namespace
 
-template <>
-void report<float>(const Report<float>& report, CudaStream stream) {
+template <> void report<float>(const Report<float>& report, CudaStream stream) {
   const auto blocks =
       unsigned(report.views) + blocks_for(report.tile_end - report.tile_begin, kReportThreads);
   if (blocks == 0) return;
@@ -56,8 +55,7 @@ void report<float>(const Report<float>& report, CudaStream stream) {
   check_launch("report");
 }
 
-template <>
-void loss_of_sums<float>(const LossOfSums<float>& args, CudaStream stream) {
+template <> void loss_of_sums<float>(const LossOfSums<float>& args, CudaStream stream) {
   loss_of_sums_kernel<<<1, kLossThreads, 0, stream>>>(args);
   check_launch("loss_of_sums");
 }

@@ -32,8 +32,7 @@ struct PoseRow {
   double n[3], offset;
 };
 
-template <class T>
-BLITZGS_HD PoseRow pose_row(const Vec3<T>& row, T offset) {
+template <class T> BLITZGS_HD PoseRow pose_row(const Vec3<T>& row, T offset) {
   return {{double(row.x), double(row.y), double(row.z)}, double(offset)};
 }
 

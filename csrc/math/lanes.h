@@ -20,21 +20,18 @@ namespace {
 constexpr int kLanes = 8;
 
 // Eight values, of lane i f(i).
-template <class Eight, class F>
-Eight make_eight(F f) {
+template <class Eight, class F> Eight make_eight(F f) {
   Eight r;
   for (int i = 0; i < kLanes; ++i) r.v[i] = f(i);
   return r;
 }
 
 // Eight values, f of those of each lane.
-template <class Eight, class F, class... Lanes>
-Eight map_eight(F f, Lanes... lanes) {
+template <class Eight, class F, class... Lanes> Eight map_eight(F f, Lanes... lanes) {
   return make_eight<Eight>([&](int i) { return f(lanes.v[i]...); });
 }
 
-template <class T>
-struct PlainLanes {
+template <class T> struct PlainLanes {
   using Scalar = T;
   struct Mask {
     bool v[kLanes];
@@ -66,12 +63,8 @@ struct PlainLanes {
 
   T v[kLanes];
 
-  template <class F>
-  static PlainLanes make(F f) {
-    return make_eight<PlainLanes>(f);
-  }
-  template <class F>
-  static PlainLanes map(F f, PlainLanes a, PlainLanes b) {
+  template <class F> static PlainLanes make(F f) { return make_eight<PlainLanes>(f); }
+  template <class F> static PlainLanes map(F f, PlainLanes a, PlainLanes b) {
     return map_eight<PlainLanes>(f, a, b);
   }
   static PlainLanes map(T (*f)(T), PlainLanes a) { return map_eight<PlainLanes>(f, a); }
@@ -208,8 +201,7 @@ struct Avx2Lanes {
 // 2^x for x <= 0, with the same bits for all lane types and a relative error below 1.1e-7 (1 ulp). x below
 // -126 counts as -126. NaN stays NaN. x is split into the nearest integer, which is added to the exponent
 // bits, and f in [-1/2, 1/2], of which a minimax polynomial of degree 6 gives 2^f (relative error 2e-9).
-template <class Lanes>
-inline Lanes exp2_nonpositive(Lanes x) {
+template <class Lanes> inline Lanes exp2_nonpositive(Lanes x) {
   const Lanes clamped = Lanes::max(Lanes::broadcast(-126.0f), x);
   const Lanes n = Lanes::round(clamped);
   const Lanes f = clamped - n;

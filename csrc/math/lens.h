@@ -41,8 +41,7 @@ struct LensPose {
   }
 };
 
-template <class T>
-BLITZGS_HD LensPose load_pose(const T* m) {
+template <class T> BLITZGS_HD LensPose load_pose(const T* m) {
   return {{{m[0], m[4], m[8]}, {m[1], m[5], m[9]}, {m[2], m[6], m[10]}}, {m[3], m[7], m[11]}};
 }
 

@@ -17,8 +17,7 @@ Values flat(const Columns3<double>& c) {
   return {c.x.x, c.x.y, c.x.z, c.y.x, c.y.y, c.y.z, c.z.x, c.z.y, c.z.z};
 }
 
-template <class T>
-Camera<T> test_camera() {
+template <class T> Camera<T> test_camera() {
   // A rotation of 30 degrees about y, then a shift.
   const T c = T(std::sqrt(0.75)), s = T(0.5);
   const T viewmat[16] = {c, 0, s, T(0.2), 0, 1, 0, T(-0.1), -s, 0, c, T(3), 0, 0, 0, 1};

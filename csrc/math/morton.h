@@ -27,15 +27,13 @@ BLITZGS_HD uint64_t spread_bits(uint64_t x) {
   return x;
 }
 
-template <class T>
-BLITZGS_HD bool is_finite_point(const T* p) {
+template <class T> BLITZGS_HD bool is_finite_point(const T* p) {
   const T sum = p[0] * T(0) + p[1] * T(0) + p[2] * T(0);
   return sum == T(0);
 }
 
 // The code of a point. A point that is not finite gets all ones, so that it sorts last.
-template <class T>
-BLITZGS_HD uint64_t morton_code(const T* p, const MortonFrame& frame) {
+template <class T> BLITZGS_HD uint64_t morton_code(const T* p, const MortonFrame& frame) {
   if (!is_finite_point(p)) return ~uint64_t{0};
   uint64_t code = 0;
   for (int axis = 0; axis < 3; ++axis) {
@@ -57,8 +55,7 @@ BLITZGS_HD MortonFrame make_morton_frame(const double* low, const double* high) 
 }
 
 // The frame of all finite points, on the host.
-template <class T>
-MortonFrame morton_frame_of(const T* points, int64_t n) {
+template <class T> MortonFrame morton_frame_of(const T* points, int64_t n) {
   double low[3] = {0, 0, 0}, high[3] = {0, 0, 0};
   bool first = true;
   for (int64_t i = 0; i < n; ++i) {

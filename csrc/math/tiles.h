@@ -44,12 +44,10 @@ BLITZGS_HD TileGrid make_tile_grid(int n_cameras, int width, int height, int til
 }
 
 // Clamp a value; NaN becomes the lower bound in the first and the upper bound in the second.
-template <class T>
-BLITZGS_HD T clamp_nan_low(T value, T low, T high) {
+template <class T> BLITZGS_HD T clamp_nan_low(T value, T low, T high) {
   return value > low ? (value < high ? value : high) : low;
 }
-template <class T>
-BLITZGS_HD T clamp_nan_high(T value, T low, T high) {
+template <class T> BLITZGS_HD T clamp_nan_high(T value, T low, T high) {
   return value < high ? (value > low ? value : low) : high;
 }
 
@@ -68,13 +66,11 @@ struct TileDivider {
 // The factor L of conic = L^T L, so q = (l11 dx + l21 dy)^2 + (l22 dy)^2, which is never negative and does
 // not cancel for thin splats. A conic that rounding made indefinite gets l22 = 0: a splat that is so long is
 // constant along its axis. The products of floats are exact in double.
-template <class T>
-struct ConicFactor {
+template <class T> struct ConicFactor {
   T l11, l21, l22;
 };
 
-template <class T>
-BLITZGS_HD double conic_determinant(const T* conic) {
+template <class T> BLITZGS_HD double conic_determinant(const T* conic) {
   const double b = double(conic[1]);
   const double bb = b * b;
 #ifdef __CUDA_ARCH__
@@ -85,8 +81,7 @@ BLITZGS_HD double conic_determinant(const T* conic) {
   return det > 0.0 ? det : 0.0;
 }
 
-template <class T>
-BLITZGS_HD ConicFactor<T> factor_conic(const T* conic) {
+template <class T> BLITZGS_HD ConicFactor<T> factor_conic(const T* conic) {
   ConicFactor<T> factor;
   factor.l11 = std::sqrt(conic[0]);
   factor.l21 = conic[1] / factor.l11;
@@ -95,8 +90,7 @@ BLITZGS_HD ConicFactor<T> factor_conic(const T* conic) {
 }
 
 // The enlarged ellipse of a splat relative to its mean.
-template <class T>
-struct SplatEllipse {
+template <class T> struct SplatEllipse {
   T cut;      // q <= cut
   T shear;    // the row at height dy meets the ellipse in a chord that is centred on dx = -shear * dy
   T inv_l11;  // half the length of this chord is sqrt(cut - (l22 dy)^2) * inv_l11
@@ -106,8 +100,7 @@ struct SplatEllipse {
 };
 
 // Returns false if the splat touches no pixel.
-template <class T>
-BLITZGS_HD bool make_ellipse(const T* conic, T opacity, SplatEllipse<T>* ellipse) {
+template <class T> BLITZGS_HD bool make_ellipse(const T* conic, T opacity, SplatEllipse<T>* ellipse) {
   const T a = conic[0], b = conic[1], c = conic[2];
   if (!(opacity >= T(kAlphaCut)) || !is_finite(opacity)) return false;
   if (!(a > T(0)) || !(c > T(0)) || !is_finite(a) || !is_finite(b) || !is_finite(c)) return false;
@@ -129,16 +122,14 @@ BLITZGS_HD bool make_ellipse(const T* conic, T opacity, SplatEllipse<T>* ellipse
 
 // Sets the first and last index of the pixel centres i + 0.5 in [low, high], within [0, size); first > last
 // if there is none. A bound that is NaN is ignored.
-template <class T>
-BLITZGS_HD void pixels_between(T low, T high, int size, int* first, int* last) {
+template <class T> BLITZGS_HD void pixels_between(T low, T high, int size, int* first, int* last) {
   *first = int(std::ceil(clamp_nan_low(low - T(0.5), T(0), T(size))));
   *last = int(std::floor(clamp_nan_high(high - T(0.5), T(-1), T(size - 1))));
 }
 
 // Returns x at one end of the ellipse's interval over a band of rows. side is -1 for the left end and 1 for
 // the right one; dy is the height within the band at which that end lies furthest out.
-template <class T>
-BLITZGS_HD T chord_end(const SplatEllipse<T>& e, T x, T y, T dy, T side) {
+template <class T> BLITZGS_HD T chord_end(const SplatEllipse<T>& e, T x, T y, T dy, T side) {
   constexpr T kRounding = sizeof(T) == 4 ? T(1e-6) : T(1e-14);
   const T w = e.l22 * dy;
   const T rest = mul_add(-w, w, e.cut);
@@ -152,8 +143,7 @@ BLITZGS_HD T chord_end(const SplatEllipse<T>& e, T x, T y, T dy, T side) {
 }
 
 // The tile rows that a splat's ellipse may reach, and the interval of tiles in each of them.
-template <class T>
-struct TileRows {
+template <class T> struct TileRows {
   SplatEllipse<T> ellipse;
   T x, y;                   // the splat's mean
   int row_first, row_last;  // pixel rows

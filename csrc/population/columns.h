@@ -24,8 +24,7 @@ struct CopyRows {
 constexpr int kMaxCheckedColumns = 16;
 
 // values [length] of n columns. zero_is_bad: look for zeros instead.
-template <class T>
-struct CheckedColumns {
+template <class T> struct CheckedColumns {
   struct Column {
     const T* values;
     int64_t length;
@@ -36,8 +35,7 @@ struct CheckedColumns {
   int32_t* bad;
 };
 
-template <class T>
-BLITZGS_HD bool is_bad(T value, bool zero_is_bad) {
+template <class T> BLITZGS_HD bool is_bad(T value, bool zero_is_bad) {
   // A number that is not finite, times zero, is NaN.
   return zero_is_bad ? value == T(0) : !(value * T(0) == T(0));
 }
@@ -129,8 +127,7 @@ struct KeysUpTo {
 namespace BLITZGS_BACKEND {
 void copy_rows(const CopyRows&, CudaStream);
 void clear_flag(int32_t* bad, CudaStream);
-template <class T>
-void check_columns(const CheckedColumns<T>&, CudaStream);
+template <class T> void check_columns(const CheckedColumns<T>&, CudaStream);
 void key_histogram(const KeyHistogram&, CudaStream);
 void find_digit(const FindDigit&, CudaStream);
 }  // namespace BLITZGS_BACKEND

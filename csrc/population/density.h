@@ -24,8 +24,7 @@ namespace blitzgs {
 // is not positive. In double, because the determinant of a thin splat's conic is a small difference. If that
 // is less than the rounding of the conic's own numbers, the rounding takes its place: the splat is then at
 // least so long, and not mistaken for a small one.
-template <class T>
-BLITZGS_HD T three_sigma_radius(const T* conic) {
+template <class T> BLITZGS_HD T three_sigma_radius(const T* conic) {
   constexpr double kRounding = std::numeric_limits<T>::epsilon();
   const double a = double(conic[0]), c = double(conic[2]);
   if (!(a > 0 && c > 0)) return 0;
@@ -36,8 +35,7 @@ BLITZGS_HD T three_sigma_radius(const T* conic) {
   return T(std::ceil(3 * std::sqrt(half_trace + std::sqrt(gap > 0.1 ? gap : 0.1))));
 }
 
-template <class T>
-struct DensityStats {
+template <class T> struct DensityStats {
   T* grad_sum;          // [N]
   int32_t* grad_count;  // [N]
   T* max_radii;         // [N]
@@ -136,8 +134,7 @@ struct TreeSumsArgs {
 };
 
 // The sum for one row; row[i] is its feature i.
-template <class Row>
-BLITZGS_HD int64_t tree_sum_of(const TreeSumsArgs& args, const Row& row) {
+template <class Row> BLITZGS_HD int64_t tree_sum_of(const TreeSumsArgs& args, const Row& row) {
   int64_t sum = 0;
   for (int tree = 0; tree < args.n_trees; ++tree) {
     int32_t at = args.roots[tree];

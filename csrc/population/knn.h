@@ -23,13 +23,11 @@ constexpr int kKnnFan = 8;      // points per leaf and children per node
 constexpr int kKnnLevels = 11;  // 8^11 > 2^31 points
 constexpr int kKnnMaxK = 32;
 
-template <class T>
-struct KnnBox {
+template <class T> struct KnnBox {
   T low[3], high[3];
 };
 
-template <class T>
-struct KnnTree {
+template <class T> struct KnnTree {
   const T* points;       // [n, 3], in curve order
   const int32_t* order;  // [n], row of each sorted point
   int32_t n;             // finite points
@@ -40,8 +38,7 @@ struct KnnTree {
 };
 
 // Row i: the box of node i of a level, around 8 points (level 0) or around 8 boxes of the level below.
-template <class T>
-struct KnnLevel {
+template <class T> struct KnnLevel {
   KnnTree<T> tree;
   int level;
   int64_t n;
@@ -64,8 +61,7 @@ struct KnnLevel {
 };
 
 // A query for one point. best: the K smallest squared distances found so far, ascending.
-template <class T, int K>
-struct KnnQuery {
+template <class T, int K> struct KnnQuery {
   const KnnTree<T>& tree;
   T p[3];
   T best[K];
@@ -136,8 +132,7 @@ struct KnnQuery {
   }
 };
 
-template <class T, int K>
-BLITZGS_HD void knn_row(const KnnTree<T>& tree, int32_t i, int k, T* distances) {
+template <class T, int K> BLITZGS_HD void knn_row(const KnnTree<T>& tree, int32_t i, int k, T* distances) {
   const T* p = tree.points + 3 * int64_t{i};
   KnnQuery<T, K> query{tree, {p[0], p[1], p[2]}, {}};
   query.run(i);
@@ -151,8 +146,7 @@ BLITZGS_HD void knn_row(const KnnTree<T>& tree, int32_t i, int k, T* distances) 
 }
 
 // Calls f with a compile-time constant K >= k, the length of the list of neighbours.
-template <class F>
-void with_knn_length(int k, const F& f) {
+template <class F> void with_knn_length(int k, const F& f) {
   if (k == 1) return f.template operator()<1>();
   if (k == 2) return f.template operator()<2>();
   if (k == 3) return f.template operator()<3>();
@@ -162,8 +156,7 @@ void with_knn_length(int k, const F& f) {
 
 namespace BLITZGS_BACKEND {
 // Makes the levels of a tree above its sorted points.
-template <class T>
-void make_knn_boxes(KnnTree<T>& tree, Workspace& workspace, CudaStream stream) {
+template <class T> void make_knn_boxes(KnnTree<T>& tree, Workspace& workspace, CudaStream stream) {
   int64_t total = 0;
   int32_t count = tree.n;
   do {

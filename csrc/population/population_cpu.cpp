@@ -9,8 +9,7 @@ namespace blitzgs::cpu {
 
 void clear_flag(int32_t* bad, CudaStream) { *bad = 0; }
 
-template <class T>
-void check_columns(const CheckedColumns<T>& checked, CudaStream) {
+template <class T> void check_columns(const CheckedColumns<T>& checked, CudaStream) {
   std::atomic<bool> found{false};
   for (int c = 0; c < checked.n; ++c) {
     const auto& column = checked.columns[c];

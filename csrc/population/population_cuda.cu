@@ -69,8 +69,7 @@ __global__ void __launch_bounds__(kThreads) copy_rows_kernel(const CopyRows copy
 }
 
 // Launches the kernel and returns true if the rows are whole, aligned numbers of words of this type.
-template <class Word>
-bool launch_if_whole(const CopyRows& copy, CudaStream stream) {
+template <class Word> bool launch_if_whole(const CopyRows& copy, CudaStream stream) {
   const auto places =
       reinterpret_cast<std::uintptr_t>(copy.column) | reinterpret_cast<std::uintptr_t>(copy.out);
   if (copy.row_bytes % sizeof(Word) != 0 || places % sizeof(Word) != 0) return false;
@@ -170,8 +169,7 @@ void clear_flag(int32_t* bad, CudaStream stream) {
   check(cudaMemsetAsync(bad, 0, sizeof(*bad), stream), "find_non_finite");
 }
 
-template <>
-void check_columns<float>(const CheckedColumns<float>& checked, CudaStream stream) {
+template <> void check_columns<float>(const CheckedColumns<float>& checked, CudaStream stream) {
   if (checked.n == 0) return;
   check_columns_kernel<<<dim3(kBlocks, unsigned(checked.n)), kThreads, 0, stream>>>(checked);
   check_launch("find_non_finite");

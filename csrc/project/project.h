@@ -61,8 +61,7 @@ BLITZGS_HD float inverse_reach2_of(const LevelFade& fade, int64_t id) {
 // and color(r) are those of splat r, and colored() says whether there are gradients of colours.
 
 // One array for each attribute: [P, 2], [P, 3], [P], [P], [P, 3]. depths and colors may be null (zero).
-template <class T>
-struct SplatGradientColumns {
+template <class T> struct SplatGradientColumns {
   const T *means2d, *conics, *depths, *opacities, *colors;
 
   BLITZGS_HD bool colored() const { return colors != nullptr; }
@@ -93,19 +92,16 @@ struct PackedSplatGradients {
 
 // The source that the kernels of a backend read. The CPU reads columns only.
 #ifdef BLITZGS_BACKEND_CUDA
-template <class T>
-using SplatGradientSource = std::variant<SplatGradientColumns<T>, PackedSplatGradients>;
+template <class T> using SplatGradientSource = std::variant<SplatGradientColumns<T>, PackedSplatGradients>;
 #else
-template <class T>
-using SplatGradientSource = SplatGradientColumns<T>;
+template <class T> using SplatGradientSource = SplatGradientColumns<T>;
 #endif
 
 // means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, K, 3] or null; viewmats [B, 4, 4], Ks [B,
 // 3, 3]. The candidates are the rows active_ids [n_candidates] (ascending), or all N when null, of which
 // n_active (CUDA, in device memory; null: all) are valid. Bit v of active_views[c] allows view v for
 // candidate c (null: all). n_blocks (in the memory of the inputs) is copied to totals[kTotalBlocks]; null: 0.
-template <class T>
-struct ProjectInputs {
+template <class T> struct ProjectInputs {
   const T *means, *quats, *scales, *opacities, *sh, *viewmats, *Ks;
   const int32_t *active_ids, *active_views;
   int64_t n_candidates;
@@ -165,35 +161,30 @@ struct ProjectIds {
 // without sh), radii [P, 2], tiles_touched [P], rank_masks [P] (bit m: rank m composites tiles of the splat;
 // null on one rank). splat_ids [P] takes the persistent ids of the splats' Gaussians from ids [N], those of
 // all Gaussians; splat_ids null: not wanted.
-template <class T>
-struct ProjectOutputs {
+template <class T> struct ProjectOutputs {
   T *means2d, *conics, *depths, *opacities, *colors;
   int32_t *radii, *tiles_touched;
   int64_t *rank_masks, *splat_ids;
   const int64_t* ids;
 };
 
-template <class T>
-struct ProjectColumns {
+template <class T> struct ProjectColumns {
   ProjectIds ids;
   ProjectOutputs<T> values;
 };
 
-template <class T>
-using SplatMemory = std::function<ProjectColumns<T>(const ProjectSizes&)>;
+template <class T> using SplatMemory = std::function<ProjectColumns<T>(const ProjectSizes&)>;
 
 // The outputs of the backward pass: one row for each visible Gaussian, [U, ...] (sh [U, K, 3], null without
 // sh), or, with `dense`, one for each Gaussian, [N, ...], which the caller fills with zeros. viewmats [B, 4,
 // 4] or null.
-template <class T>
-struct ProjectGradients {
+template <class T> struct ProjectGradients {
   T *means, *quats, *scales, *opacities, *sh, *viewmats;
   bool dense = false;
 };
 
 // Arrays that are set to zero together; on CUDA by one launch, which takes the host microseconds.
-template <class T>
-struct ZeroedArrays {
+template <class T> struct ZeroedArrays {
   static constexpr int kCount = 5;
   T* begin[kCount];
   int64_t length[kCount];
@@ -202,8 +193,7 @@ struct ZeroedArrays {
 // The terms of the training loss that do not depend on pixels, as weights per view, [B] each, or null (zero).
 // For each Gaussian that has a splat in view b, the loss has these summands: scale[b] times the smallest axis
 // of the Gaussian (BlitzGS, L_scale), and opacity[b] times its opacity (3DGS-MCMC, Kheradmand et al. 2024).
-template <class T>
-struct Regularisers {
+template <class T> struct Regularisers {
   const T *scale, *opacity;
 };
 
@@ -240,8 +230,7 @@ void color_splats(const ProjectInputs<T>&, const ProjectCapacity&, const Project
 template <class T>
 void project_bwd(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientSource<T>&,
                  const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream);
-template <class T>
-void zero_arrays(const ZeroedArrays<T>&, CudaStream);
+template <class T> void zero_arrays(const ZeroedArrays<T>&, CudaStream);
 // project_bwd followed by lazy_adam of the visible Gaussians; on CUDA one kernel does both, so that gradients
 // need not be written to global memory. Parameters are raw, with SH. `adam` lists splats.visible_ids and has
 // no gradients; the listed rows' parameters must have caught up to step adam.step - 1.

@@ -131,8 +131,7 @@ __global__ void __launch_bounds__(kZeroThreads) zero_arrays_kernel(const ZeroedA
 
 }  // namespace
 
-template <>
-void zero_arrays<float>(const ZeroedArrays<float>& arrays, CudaStream stream) {
+template <> void zero_arrays<float>(const ZeroedArrays<float>& arrays, CudaStream stream) {
   int64_t most = 0;
   for (const int64_t length : arrays.length) most = length > most ? length : most;
   if (most == 0) return;

@@ -10,8 +10,7 @@ namespace blitzgs::cuda {
 constexpr int kBackwardThreads = 128;
 
 // v: the gradients of the splats, one alternative of SplatGradientSource.
-template <class Source>
-struct BackwardInputs {
+template <class Source> struct BackwardInputs {
   Inputs in;
   SplatIndex splats;
   Source v;

@@ -9,15 +9,13 @@
 namespace blitzgs::cpu {
 namespace {
 
-template <class T>
-std::vector<Camera<T>> make_cameras(const ProjectInputs<T>& in) {
+template <class T> std::vector<Camera<T>> make_cameras(const ProjectInputs<T>& in) {
   std::vector<Camera<T>> cameras;
   for (int view = 0; view < in.n_views; ++view) cameras.push_back(in.camera(view));
   return cameras;
 }
 
-template <class T>
-ActivatedGaussian<T> load_gaussian(const ProjectInputs<T>& in, int64_t id) {
+template <class T> ActivatedGaussian<T> load_gaussian(const ProjectInputs<T>& in, int64_t id) {
   return activate_gaussian(
       load3(in.means + 3 * id), in.quats + 4 * id, activate_scale(in.scales + 3 * id, in.options.raw),
       activate_opacity(in.opacities[id], in.options.raw), T(inverse_reach2_of(in.fade, id)));
@@ -25,8 +23,7 @@ ActivatedGaussian<T> load_gaussian(const ProjectInputs<T>& in, int64_t id) {
 
 // A splat that the counting pass of project() found, kept for the writing pass: the splat, its Gaussian and
 // view, the number of its tiles, and the ranks that need it as bits.
-template <class T>
-struct KeptSplat {
+template <class T> struct KeptSplat {
   Splat<T> splat;
   int32_t id, view, tiles;
   int64_t ranks;
@@ -34,8 +31,7 @@ struct KeptSplat {
 
 // The result of the counting pass for a block of kProjectBlock candidates: its splats, the number of its
 // visible Gaussians, and the numbers of visible Gaussians and splats in all blocks before it.
-template <class T>
-struct CountedBlock {
+template <class T> struct CountedBlock {
   std::vector<KeptSplat<T>> splats;
   int64_t visible = 0, visible_before = 0, splats_before = 0;
 };
@@ -133,8 +129,7 @@ void gaussian_bwd(const ProjectInputs<T>& in, const std::vector<Camera<T>>& came
 }
 
 // Adds the pose gradients [B] of one block to the block's sums [B, 12].
-template <class T>
-void store_poses(const std::vector<PoseGradient<T>>& poses, double* sums) {
+template <class T> void store_poses(const std::vector<PoseGradient<T>>& poses, double* sums) {
   for (const PoseGradient<T>& pose : poses) {
     const Vec3<T> columns[4] = {pose.row_x, pose.row_y, pose.row_z, pose.translation};
     for (const Vec3<T>& column : columns) {
@@ -145,8 +140,7 @@ void store_poses(const std::vector<PoseGradient<T>>& poses, double* sums) {
   }
 }
 
-template <class T>
-void reduce_poses(const double* sums, int64_t n_blocks, int n_views, T* v_viewmats) {
+template <class T> void reduce_poses(const double* sums, int64_t n_blocks, int n_views, T* v_viewmats) {
   std::fill_n(v_viewmats, 16 * n_views, T(0));
   for (int view = 0; view < n_views; ++view) {
     for (int i = 0; i < 12; ++i) {
@@ -238,8 +232,7 @@ void project_bwd(const ProjectInputs<T>& in, const SplatIndex& splats, const Spl
   if (out.viewmats) reduce_poses(pose_sums.data(), blocks, in.n_views, out.viewmats);
 }
 
-template <class T>
-void zero_arrays(const ZeroedArrays<T>& arrays, CudaStream) {
+template <class T> void zero_arrays(const ZeroedArrays<T>& arrays, CudaStream) {
   for (int a = 0; a < ZeroedArrays<T>::kCount; ++a) parallel_zero(arrays.begin[a], arrays.length[a]);
 }
 

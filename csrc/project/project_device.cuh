@@ -103,8 +103,7 @@ struct TripleStage {
 };
 
 // The SH coefficients of one Gaussian that the degree uses, in registers.
-template <int DEGREE>
-struct ShRow {
+template <int DEGREE> struct ShRow {
   static constexpr int kCount = 3 * (DEGREE + 1) * (DEGREE + 1);
   static constexpr bool kWhole = kCount % 4 == 0;  // whether the row is a whole number of 16-byte quads
   static constexpr int kQuads = kWhole ? kCount / 4 : 1;
@@ -123,8 +122,7 @@ struct ShRow {
 
 // Shared memory for the 32 SH rows of a warp. In each load or store the lanes move consecutive 16-byte pieces
 // of two or three rows. One lane per row would touch 32 cache lines at a time.
-template <int DEGREE>
-struct ShStage {
+template <int DEGREE> struct ShStage {
   using Row = ShRow<DEGREE>;
   static constexpr int kPitch = Row::kQuads | 1;  // odd: quads of the same column lie in different banks
   float4 quads[32 * kPitch];
@@ -189,8 +187,7 @@ struct ShStage {
 
 // Calls f(degree, quads) with two integral constants: the SH degree (0 without SH), and whether SH rows can
 // be moved 16 bytes at a time.
-template <class F>
-void dispatch_sh(const Inputs& in, const F& f) {
+template <class F> void dispatch_sh(const Inputs& in, const F& f) {
   const auto with_degree = [&](auto degree) {
     if (in.sh && 3 * in.options.sh_stride % 4 == 0 && aligned16(in.sh)) {
       f(degree, std::bool_constant<ShRow<degree.value>::kWhole>{});

@@ -123,12 +123,10 @@ struct BackwardInputs {
   bool in_table() const { return v_splats.size() == 1; }
   int64_t visible() const { return visible_ids.numel(); }
   SplatIndex pointers() const { return {camera_ids, visible_ids, splat_offsets, visible()}; }
-  template <class T>
-  Regularisers<T> regularisers() const {
+  template <class T> Regularisers<T> regularisers() const {
     return {data_or_null<T>(scale_reg), data_or_null<T>(opacity_reg)};
   }
-  template <class T>
-  SplatGradientSource<T> gradients() const {
+  template <class T> SplatGradientSource<T> gradients() const {
 #ifdef BLITZGS_BACKEND_CUDA
     if (in_table())
       return PackedSplatGradients{reinterpret_cast<const SplatGradient*>(data<float>(v_splats[0]))};

@@ -89,8 +89,7 @@ struct ProjectArguments {
     if (level) set_fade(*level, numbers, fade);
   }
 
-  template <class T>
-  ProjectInputs<T> inputs() const {
+  template <class T> ProjectInputs<T> inputs() const {
     const ProjectOptions<double>& o = options;
     return {data<T>(means),
             data<T>(quats),

@@ -160,8 +160,7 @@ BLITZGS_HD void unscented_splat_vjp(const LensCamera& camera, const ActivatedGau
 
 // What the three passes below read. lenses [B, kLensNumbers]; viewmats_rs [B, 4, 4], the poses at the end of
 // the frame, null for a global shutter.
-template <class T>
-struct UnscentedInputs {
+template <class T> struct UnscentedInputs {
   ProjectInputs<T> in;
   const T *lenses, *viewmats_rs;
   UnscentedOptions options;
@@ -180,8 +179,7 @@ struct UnscentedInputs {
 };
 
 // Row i: whether Gaussian i / B has a splat in view i % B; seen [N, B].
-template <class T>
-struct UnscentedVisible {
+template <class T> struct UnscentedVisible {
   UnscentedInputs<T> inputs;
   bool* seen;
   int64_t n;
@@ -195,8 +193,7 @@ struct UnscentedVisible {
 };
 
 // Row i: the values of splat i, of Gaussian gaussian_ids[i] in view camera_ids[i].
-template <class T>
-struct UnscentedSplats {
+template <class T> struct UnscentedSplats {
   UnscentedInputs<T> inputs;
   const int32_t *gaussian_ids, *camera_ids;
   ProjectOutputs<T> out;
@@ -229,8 +226,7 @@ struct UnscentedSplats {
 
 // Row i: the gradients of Gaussian i of N, whose splats are offsets[i] to offsets[i + 1] - 1; zeros if it has
 // none. offsets [N + 1]. The outputs have a row for each Gaussian; viewmats get none.
-template <class T>
-struct UnscentedGradients {
+template <class T> struct UnscentedGradients {
   UnscentedInputs<T> inputs;
   const int32_t *camera_ids, *offsets;
   SplatGradientColumns<T> v;

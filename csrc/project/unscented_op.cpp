@@ -36,8 +36,7 @@ struct UnscentedArguments {
     options.beyond = transform[1] - alpha2;
   }
 
-  template <class T>
-  UnscentedInputs<T> inputs() const {
+  template <class T> UnscentedInputs<T> inputs() const {
     return {p.inputs<T>(), data<T>(lenses), data_or_null<T>(viewmats_rs), options};
   }
 };

@@ -81,8 +81,7 @@ struct QuadAlphas {
 // The state of one pixel while its list is composited. For each four entries, alphas() comes first, and then
 // composite() of each alpha in order. `ended` is a byte offset of an entry in the current batch. The
 // transmittance and the weights are in units of 1 / kScale. It is a power of two, so it changes no rounding.
-template <int64_t kScale = 1>
-struct Compositor {
+template <int64_t kScale = 1> struct Compositor {
   static constexpr uint32_t kNone = ~0u;
   static constexpr float kEnd = float(kMinTransmittance) * float(kScale);
   float transmittance = float(kScale);

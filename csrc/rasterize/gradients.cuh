@@ -30,15 +30,13 @@ __device__ __forceinline__ void add_quad(float* address, float a, float b, float
 }
 
 // The gradients of the loss by the colours of a subtile's pixels, channel by channel.
-template <int CHANNELS>
-struct __align__(16) SubtileGradient {
+template <int CHANNELS> struct __align__(16) SubtileGradient {
   float v[CHANNELS][kSubtile * kSubtile];
 };
 
 // The sums of one entry over the pixels of a subtile: weights times v_render (the colour's gradient), the
 // moments of g about the subtile's centre, and the absolute values of the mean's gradient (absgrad).
-template <int CHANNELS>
-struct EntrySums {
+template <int CHANNELS> struct EntrySums {
   float color[CHANNELS] = {};
   float g = 0.f, gx = 0.f, gy = 0.f, gxx = 0.f, gxy = 0.f, gyy = 0.f;
   float abs_x = 0.f, abs_y = 0.f;
@@ -117,8 +115,7 @@ __device__ __forceinline__ PackedGradient finish(const EntrySums<CHANNELS>& s, c
 }
 
 // The state of one pixel while the backward pass visits its list from the last entry to the first.
-template <int CHANNELS>
-struct BackwardPixel {
+template <int CHANNELS> struct BackwardPixel {
   float transmittance;  // in front of the entries visited so far
   float behind;         // v . (the colour of those entries and the background, as seen with T = 1)
   float v[CHANNELS];    // the gradient of the loss by the pixel's colour

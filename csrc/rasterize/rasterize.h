@@ -40,8 +40,7 @@
 
 namespace blitzgs {
 
-template <class T>
-struct RasterizeInput {
+template <class T> struct RasterizeInput {
   const T *means2d, *conics, *opacities, *colors;
   const T* backgrounds;  // null: black
   const int32_t* isect_splats;
@@ -52,24 +51,21 @@ struct RasterizeInput {
   const int64_t* known_splats = nullptr;  // null: n_splats
 };
 
-template <class T>
-struct RasterizeOutput {
+template <class T> struct RasterizeOutput {
   T *renders, *transmittances;
   int32_t *last_ids, *tile_work;
   T* splat_gradients;  // null, or [P] SplatGradient that forward sets to zero (CUDA, up to four channels)
   bool clear_rest;
 };
 
-template <class T>
-struct RasterizeSaved {
+template <class T> struct RasterizeSaved {
   const T* transmittances;
   const int32_t* last_ids;
   const T* v_renders;
   const T* v_alphas;  // null: zero
 };
 
-template <class T>
-struct RasterizeGradients {
+template <class T> struct RasterizeGradients {
   T *v_means2d, *v_conics, *v_opacities, *v_colors;
   T* v_means2d_abs;  // null: not wanted
 };
@@ -103,8 +99,7 @@ struct RasterizeAux {
 //   Rows without a pixel are not written. Without slots, the rows are the pixels, R = B H W.
 //
 // The cost is that of compositing without colours, and O(strongest) for each of the strongest so far.
-template <class T>
-struct PixelSplats {
+template <class T> struct PixelSplats {
   const int32_t* slots;  // null: a row for each pixel
   int64_t rows;
   int strongest;
@@ -138,8 +133,7 @@ namespace {
 constexpr float kMedianTransmittance = 0.5f;
 
 // The row of a pixel; negative: none.
-template <class T>
-BLITZGS_HD int64_t row_of(const PixelSplats<T>& out, int64_t pixel) {
+template <class T> BLITZGS_HD int64_t row_of(const PixelSplats<T>& out, int64_t pixel) {
   if (!out.slots) return pixel;
   const int64_t slot = out.slots[pixel];
   return slot < out.rows ? slot : -1;

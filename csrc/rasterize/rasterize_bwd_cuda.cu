@@ -16,8 +16,7 @@ struct BackwardArguments : ChunkInput {
   PackedGradient* entry_gradients;  // [I], written once each (deterministic)
 };
 
-template <int CHANNELS, bool DETERMINISTIC>
-struct BackwardShared {
+template <int CHANNELS, bool DETERMINISTIC> struct BackwardShared {
   static constexpr int kBatch = DETERMINISTIC ? 64 : 256;
   static constexpr int kWarps = Tile::kWarps, kSubtiles = Tile::kSubtiles;
   EntryBatch<kBatch> batch;

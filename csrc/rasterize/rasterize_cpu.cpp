@@ -9,8 +9,7 @@ namespace {
 // are still in the cache when they are summed.
 constexpr int64_t kPartialsPerChunk = 1 << 17;
 
-template <class T>
-void clear_unowned(const RasterizeInput<T>& in, const RasterizeOutput<T>& out) {
+template <class T> void clear_unowned(const RasterizeInput<T>& in, const RasterizeOutput<T>& out) {
   const TileGrid& grid = in.grid;
   if (grid.tile_begin == 0 && grid.tile_end == grid.count()) return;
   const int64_t pixels = int64_t(grid.n_cameras) * grid.height * grid.width;

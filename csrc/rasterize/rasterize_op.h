@@ -35,8 +35,7 @@ struct ListedSplats {
     backgrounds = checked("backgrounds", backgrounds_in, dtype, {grid.n_cameras, n_channels});
   }
 
-  template <class T>
-  RasterizeInput<T> input() const {
+  template <class T> RasterizeInput<T> input() const {
     return {data<T>(means2d),
             data<T>(conics),
             data<T>(opacities),

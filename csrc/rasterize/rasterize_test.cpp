@@ -13,8 +13,7 @@ namespace {
 using namespace blitzgs;
 
 // Two splats on a 40 x 20 image: splat 0 is wide and far, splat 1 is round and near.
-template <class T>
-struct Scene {
+template <class T> struct Scene {
   TileGrid grid = make_tile_grid(1, 40, 20, 16, 0, -1);
   std::vector<T> means2d{T(20.5), T(10.5), T(12), T(8)};
   std::vector<T> conics{T(0.02), T(0.005), T(0.03), T(0.25), T(0), T(0.25)};

@@ -266,8 +266,7 @@ __device__ __forceinline__ float log2_alpha(const Entry& entry, const Pixel& pix
 // for each batch place(this batch), barrier, fetch(next batch), list(this batch). One barrier per batch is
 // enough: the data that fetch() overwrites was last read before this barrier, and the data that place()
 // overwrites was last read before the previous one.
-template <int BATCH>
-struct EntryBatch {
+template <int BATCH> struct EntryBatch {
   static constexpr int kWords = BATCH / 32;
   static constexpr int kLaneBits =
       BATCH / kHalfWarp;  // entries of the batch that each lane of list() handles

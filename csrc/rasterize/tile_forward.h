@@ -22,8 +22,7 @@ constexpr T kExponentScale = sizeof(T) == 4 ? T(0.72134752044448170f) : T(0.5); 
 // A splat prepared for the kernels, one cache line in float32. It may touch pixels with u^2 + w^2 <= cut, in
 // rows within half_height of y (-1: no row). In the row at dy, these pixels are centred on x - shear dy, with
 // a half width of sqrt(cut - w^2) * inv_l11 + slack.
-template <class T>
-struct alignas(64) PreparedSplat {
+template <class T> struct alignas(64) PreparedSplat {
   T x, y, l11, l21, l22, opacity, cut, inv_l11, shear, half_height, slack;
   T color[kPackedChannels];
 };
@@ -40,8 +39,7 @@ inline size_t tile_memory(int tile_size, int n_channels) {
   return size_t(layout.plane) * (2 + n_channels) + layout.stride;
 }
 
-template <class T>
-struct TileJob {
+template <class T> struct TileJob {
   const PreparedSplat<T>* splats;
   const T* colors;      // [P, D], for more than kPackedChannels channels
   const T* background;  // [D] or null
@@ -62,8 +60,7 @@ struct TileJob {
 enum PartialGradient { kMeanX, kMeanY, kConicA, kConicB, kConicC, kOpacity, kColor };
 constexpr int partial_width(int n_channels, bool absgrad) { return kColor + n_channels + (absgrad ? 2 : 0); }
 
-template <class T>
-struct TileKernels {
+template <class T> struct TileKernels {
   int32_t (*forward)(const TileJob<T>&);                           // returns the entries processed
   void (*backward)(const TileJob<T>&, T* partials);                // writes n_entries partial gradients
   void (*contribute)(const TileJob<T>&, const ContributionSums&);  // adds to the sums of all tiles
@@ -75,8 +72,7 @@ TileKernels<float> avx2_tile_kernels(int n_channels, bool absgrad);
 
 namespace {
 
-template <class Lanes>
-Lanes falloff(Lanes exponent) {
+template <class Lanes> Lanes falloff(Lanes exponent) {
   if constexpr (sizeof(typename Lanes::Scalar) == 4) {
     return exp2_nonpositive(exponent);
   } else {
@@ -86,8 +82,7 @@ Lanes falloff(Lanes exponent) {
 
 // A splat on each pixel row of a tile: the exponent of alpha at (dx, row) is -(l11 dx + shift)^2 + minus_w2,
 // and the splat may touch pixels [first, last] of the row.
-template <class T>
-struct RowSpans {
+template <class T> struct RowSpans {
   alignas(32) T dy[kMaxTileSize];
   alignas(32) T shift[kMaxTileSize];
   alignas(32) T minus_w2[kMaxTileSize];
@@ -129,21 +124,18 @@ uint64_t find_spans(const PreparedSplat<T>& splat, const TileJob<T>& tile, RowSp
 }
 
 // The number of channels: D if D > 0, else that of the tile.
-template <int D, class T>
-int channels(const TileJob<T>& tile) {
+template <int D, class T> int channels(const TileJob<T>& tile) {
   if constexpr (D > 0) return D;
   return tile.n_channels;
 }
 
-template <int D, class T>
-const T* splat_color(const TileJob<T>& tile, int32_t index) {
+template <int D, class T> const T* splat_color(const TileJob<T>& tile, int32_t index) {
   if constexpr (D > 0 && D <= kPackedChannels) return tile.splats[index].color;
   return tile.colors + int64_t(index) * channels<D>(tile);
 }
 
 // The state of a tile's pixels in its memory: planes of zeros, and the pixel centres of a row.
-template <class State, class T>
-State start_planes(const TileJob<T>& tile, int n_channels) {
+template <class State, class T> State start_planes(const TileJob<T>& tile, int n_channels) {
   const PlaneLayout layout(tile.tile_size);
   const ptrdiff_t plane = layout.plane, used = plane * (2 + n_channels);
   T* memory = tile.memory;
@@ -153,8 +145,7 @@ State start_planes(const TileJob<T>& tile, int n_channels) {
   return {layout, memory, memory + plane, memory + 2 * plane, memory + used, tile.last_memory};
 }
 
-template <class T>
-struct ForwardState {
+template <class T> struct ForwardState {
   PlaneLayout layout;
   T *transmittance, *ended, *color, *centres;
   int32_t* last;
@@ -162,8 +153,7 @@ struct ForwardState {
   int32_t alive_in_row[kMaxTileSize] = {};
 };
 
-template <int D, class T>
-ForwardState<T> start_forward(const TileJob<T>& tile) {
+template <int D, class T> ForwardState<T> start_forward(const TileJob<T>& tile) {
   auto state = start_planes<ForwardState<T>>(tile, channels<D>(tile));
   for (int row = 0; row < tile.height; ++row) {
     std::fill_n(state.transmittance + row * state.layout.stride, tile.width, T(1));
@@ -176,8 +166,7 @@ ForwardState<T> start_forward(const TileJob<T>& tile) {
 // Ends pixels x + i of a row, for each bit i of `bits`. A pixel that has not ended has transmittance > 0 (it
 // starts at 1 and stays above the minimum). For a pixel that ends, the transmittance moves to `ended`, and a
 // transmittance of 0 marks it as ended.
-template <class T>
-void end_pixels(ForwardState<T>& state, int row, int x, unsigned bits) {
+template <class T> void end_pixels(ForwardState<T>& state, int row, int x, unsigned bits) {
   for (; bits; bits &= bits - 1) {
     const int pixel = row * state.layout.stride + x + std::countr_zero(bits);
     state.ended[pixel] = state.transmittance[pixel];
@@ -210,8 +199,7 @@ inline void composite(const PreparedSplat<T>& splat, const RowSpans<T>& spans, i
   if (ending.any()) end_pixels(state, row, x, ending.bits());
 }
 
-template <int D, class T>
-void write_pixels(const TileJob<T>& tile, const ForwardState<T>& state) {
+template <int D, class T> void write_pixels(const TileJob<T>& tile, const ForwardState<T>& state) {
   for (int row = 0; row < tile.height; ++row) {
     for (int x = 0; x < tile.width; ++x) {
       const int pixel = row * state.layout.stride + x;
@@ -258,8 +246,7 @@ int32_t composite_list(const TileJob<T>& tile, ForwardState<T>& state, Sink& sin
 }
 
 // Sums the colours of the splats, times their weights, in planes of pixels [D, plane].
-template <class Lanes, int D, class T>
-struct ColorSink {
+template <class Lanes, int D, class T> struct ColorSink {
   const TileJob<T>& tile;
   T* planes;
   ptrdiff_t plane;
@@ -276,8 +263,7 @@ struct ColorSink {
 };
 
 // Composites one tile of the image and writes its pixels. Returns the number of entries processed.
-template <class Lanes, int D>
-int32_t forward_tile(const TileJob<typename Lanes::Scalar>& tile) {
+template <class Lanes, int D> int32_t forward_tile(const TileJob<typename Lanes::Scalar>& tile) {
   using T = typename Lanes::Scalar;
   ForwardState<T> state = start_forward<D>(tile);
   ColorSink<Lanes, D, T> sink{tile, state.color, state.layout.plane};
@@ -288,8 +274,7 @@ int32_t forward_tile(const TileJob<typename Lanes::Scalar>& tile) {
 
 // Sums the weights alpha T, their squares if these are wanted, and the pixels of each splat. The summands are
 // integers in units of 2^-32, so that the order of the tiles does not change the sums.
-template <class Lanes, class T>
-struct ContributionSink {
+template <class Lanes, class T> struct ContributionSink {
   const ContributionSums& sums;
   int64_t weight = 0, squares = 0;
   int32_t pixels = 0;
@@ -321,8 +306,7 @@ void contribute_tile(const TileJob<typename Lanes::Scalar>& tile, const Contribu
   composite_list<Lanes>(tile, state, sink);
 }
 
-template <class Lanes, class T>
-struct PixelSink {
+template <class Lanes, class T> struct PixelSink {
   const TileJob<T>& tile;
   const ForwardState<T>& state;
   const PixelSplats<T>& out;

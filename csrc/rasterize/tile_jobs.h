@@ -8,16 +8,14 @@
 namespace blitzgs::cpu {
 namespace {
 
-template <class T>
-TileKernels<T> tile_kernels(int n_channels, bool absgrad) {
+template <class T> TileKernels<T> tile_kernels(int n_channels, bool absgrad) {
   if constexpr (std::is_same_v<T, float>) {
     if (use_avx2()) return avx2_tile_kernels(n_channels, absgrad);
   }
   return select_kernels<PlainLanes<T>>(n_channels, absgrad);
 }
 
-template <class T>
-PreparedSplat<T> pack_splat(const RasterizeInput<T>& in, int64_t index) {
+template <class T> PreparedSplat<T> pack_splat(const RasterizeInput<T>& in, int64_t index) {
   constexpr T kScale = kExponentScale<T>;
   constexpr T kRounding = sizeof(T) == 4 ? T(2e-6) : T(2e-14);
   PreparedSplat<T> splat{};
@@ -54,8 +52,7 @@ const PreparedSplat<T>* pack_splats(const RasterizeInput<T>& in, PreparedSplat<T
   return splats;
 }
 
-template <class T>
-PreparedSplat<T>* allocate_splats(int64_t n_splats, Workspace& workspace) {
+template <class T> PreparedSplat<T>* allocate_splats(int64_t n_splats, Workspace& workspace) {
   const size_t bytes = size_t(n_splats + 1) * sizeof(PreparedSplat<T>);
   const auto address = reinterpret_cast<std::uintptr_t>(workspace.allocate_bytes(bytes));
   return reinterpret_cast<PreparedSplat<T>*>((address + 63) / 64 * 64);
@@ -84,8 +81,7 @@ TileJob<T> make_job(const RasterizeInput<T>& in, const PreparedSplat<T>* splats,
 }
 
 // Scratch memory for the pixels of one tile per worker thread.
-template <class T>
-class TileMemory {
+template <class T> class TileMemory {
  public:
   TileMemory(const RasterizeInput<T>& in, Workspace& workspace)
       : numbers_(tile_memory(in.grid.tile_size, in.n_channels)),

@@ -14,8 +14,7 @@
 namespace blitzgs::cpu {
 namespace {
 
-template <class T>
-struct BackwardState {
+template <class T> struct BackwardState {
   PlaneLayout layout;
   T* transmittance;  // in front of the entries visited so far
   T* behind;         // v_renders . (the colour of those entries and the background, as seen with T = 1)
@@ -24,8 +23,7 @@ struct BackwardState {
   int32_t last_in_row[kMaxTileSize] = {};
 };
 
-template <int D, class T>
-BackwardState<T> start_backward(const TileJob<T>& tile) {
+template <int D, class T> BackwardState<T> start_backward(const TileJob<T>& tile) {
   const int n_channels = channels<D>(tile);
   auto state = start_planes<BackwardState<T>>(tile, n_channels);
   for (int row = 0; row < tile.height; ++row) {
@@ -50,8 +48,7 @@ BackwardState<T> start_backward(const TileJob<T>& tile) {
 }
 
 // The sums over the pixels of one splat in one tile, one partial sum per lane; g = alpha dL/dalpha.
-template <class Lanes, bool kAbs>
-struct GradientSums {
+template <class Lanes, bool kAbs> struct GradientSums {
   Lanes g = Lanes::zero(), gu = Lanes::zero(), gy = Lanes::zero();
   Lanes gxx = Lanes::zero(), gxy = Lanes::zero(), gyy = Lanes::zero();
   Lanes abs_x = Lanes::zero(), abs_y = Lanes::zero();
@@ -152,14 +149,12 @@ void backward_tile(const TileJob<typename Lanes::Scalar>& tile, typename Lanes::
 }
 
 // D: the number of channels; 0: any.
-template <class Lanes, int D>
-TileKernels<typename Lanes::Scalar> kernels_of(bool absgrad) {
+template <class Lanes, int D> TileKernels<typename Lanes::Scalar> kernels_of(bool absgrad) {
   return {forward_tile<Lanes, D>, absgrad ? backward_tile<Lanes, D, true> : backward_tile<Lanes, D, false>,
           contribute_tile<Lanes>, list_tile_splats<Lanes>};
 }
 
-template <class Lanes>
-TileKernels<typename Lanes::Scalar> select_kernels(int n_channels, bool absgrad) {
+template <class Lanes> TileKernels<typename Lanes::Scalar> select_kernels(int n_channels, bool absgrad) {
   const auto kernels = n_channels == 3   ? kernels_of<Lanes, 3>
                        : n_channels == 4 ? kernels_of<Lanes, 4>
                                          : kernels_of<Lanes, 0>;

@@ -7,8 +7,7 @@
 namespace blitzgs {
 
 // alphas[i] = 1 - transmittances[i], 0 <= i < n.
-template <class T>
-struct Alphas {
+template <class T> struct Alphas {
   const T* transmittances;
   T* alphas;
   int64_t n;
