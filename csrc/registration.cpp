@@ -7,7 +7,6 @@
 // autograd, and blitzgs/_fakes.py its fake kernel.
 #include <torch/csrc/stable/library.h>
 
-#include <cstdint>
 #include <vector>
 
 #include "common/kernel.h"
@@ -15,8 +14,8 @@
 namespace blitzgs {
 namespace {
 
-std::vector<std::int64_t> splat_gradient_layout() {
-  constexpr std::int64_t kFloat = sizeof(float);
+std::vector<int64_t> splat_gradient_layout() {
+  constexpr int64_t kFloat = sizeof(float);
   return {offsetof(SplatGradient, mean2d) / kFloat,     offsetof(SplatGradient, conic) / kFloat,
           offsetof(SplatGradient, opacity) / kFloat,    offsetof(SplatGradient, color) / kFloat,
           offsetof(SplatGradient, mean2d_abs) / kFloat, kSplatGradient};
@@ -40,13 +39,10 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "gate_views_(Tensor ids, Tensor(a!) views, Tensor? count, Tensor means, Tensor level, Tensor "
       "viewmats, float[] reach, int lod_views, Tensor? cull, int[] columns) -> ()");
 
-  // Projection: parameters to screen-space splats, ordered by (Gaussian, view). gaussians: means, quats,
-  // scales, opacities[, sh]. The options, from width to fade, are those of `blitzgs.ops.project.project`;
-  // fade: empty or, for smooth levels, the slope and the reach of each level (csrc/project/project.h), with
-  // the levels of the Gaussians in `level`. active_ids: the Gaussians to consider, of which the first
-  // n_active [1] are valid, and active_views: the views of each; absent: all. rank_tiles: begin and end of
-  // the tiles of each rank. The capacities: numbers of visible Gaussians and splats for which there is
-  // memory; absent: the op waits for the numbers.
+  // Projection. gaussians: means, quats, scales, opacities[, sh]. The options, from width to fade, are those
+  // of `blitzgs.ops.project.project`, fade with the octree levels of the Gaussians in `level`. active_ids:
+  // the candidates, of which the first n_active [1] are valid, with active_views; absent: all. rank_tiles:
+  // begin and end of each rank's tiles. Without capacities the op waits for the numbers.
   m.def(
       "project_fwd(Tensor[] gaussians, Tensor viewmats, Tensor Ks, Tensor? active_ids, Tensor? "
       "active_views, Tensor? n_active, Tensor? n_blocks, Tensor? ids, Tensor? level, SymInt width, SymInt "
@@ -73,11 +69,10 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "camera_ids, Tensor visible_ids, Tensor splat_offsets, Tensor? level, int width, int height, int "
       "tile_size, int sh_degree, float near_plane, float far_plane, float eps2d, float radius_clip, bool "
       "antialiased, bool raw, float[] fade, Tensor[] v_splats) -> ()");
-  // The unscented projection (csrc/project/unscented.h), with the options of the projection. lenses [B, 13]:
-  // k1 to k6, p1, p2, s1 to s4, the largest angle of a fisheye; shutter: 0 to 4, and viewmats_rs unless it is
-  // 4 (global); transform: alpha, beta, kappa, margin, all_valid. unscented_visible finds which Gaussians
-  // have splats in which views, [N, B]; splat_offsets [N + 1] counts these, which unscented_bwd alone reads.
-  // v_splats: the gradients of means2d, conics, depths, splat_opacities[, colors].
+  // The unscented projection (csrc/project/unscented.h). lenses [B, 13]: k1 to k6, p1, p2, s1 to s4, the
+  // largest angle of a fisheye; shutter: 0 to 4, with viewmats_rs unless 4 (global); transform: alpha, beta,
+  // kappa, margin, all_valid. unscented_visible finds which Gaussians have splats in which views, [N, B];
+  // splat_offsets [N + 1] counts them. v_splats: of means2d, conics, depths, splat_opacities[, colors].
   m.def(
       "unscented_visible(Tensor[] gaussians, Tensor viewmats, Tensor Ks, Tensor lenses, Tensor? "
       "viewmats_rs, bool fisheye, int shutter, float[] transform, int width, int height, int tile_size, "
@@ -95,13 +90,11 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "float near_plane, float far_plane, float eps2d, float radius_clip, bool antialiased, bool raw, "
       "Tensor camera_ids, Tensor splat_offsets, Tensor[] v_splats) -> (Tensor v_means, Tensor v_quats, "
       "Tensor v_scales, Tensor v_opacities, Tensor v_sh)");
-  // The offsets of mean2d, conic, opacity, color and mean2d_abs in the floats of a splat gradient, then the
-  // number of these floats.
+  // The offsets of the members of SplatGradient (common/kernel.h) in its floats, then their number.
   m.def("splat_gradient_layout() -> int[]");
 
-  // The splats that each tile composites, front to back by (depth, id). tile_begin, tile_end: the range of
-  // tiles to composite; end -1: all tiles. unchecked: the caller itself checks whether n_isects is too small,
-  // and CUDA does not wait for the number.
+  // The splats that each tile of the range composites (tile_end -1: of all), front to back. unchecked: the
+  // caller itself checks whether n_isects is too small, and CUDA does not wait for the number.
   m.def(
       "intersect(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor depths, Tensor camera_ids, "
       "Tensor? ids, SymInt n_cameras, SymInt width, SymInt height, int tile_size, int tile_begin, int "
@@ -137,9 +130,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "height, int tile_size, int tile_begin, int tile_end, bool clear_rest=True, bool "
       "backward_follows=False, Tensor? n_splats=None) -> (Tensor renders, Tensor transmittances, Tensor "
       "last_ids, Tensor tile_work, Tensor packed_splats, Tensor tile_order, Tensor splat_gradients)");
-  // rasterize_fwd for a backward pass that sums gradients in a given table, which it sets to zero. It does
-  // not write the pixels of tiles that are not owned (CUDA). An op of its own, because torch registers
-  // gradients for ops without mutable arguments alone.
+  // rasterize_fwd that sets a given table of gradients to zero and leaves the pixels of unowned tiles (CUDA).
+  // It is an op of its own, because torch registers gradients for ops without mutable arguments alone.
   m.def(
       "rasterize_fwd_(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor colors, Tensor? "
       "backgrounds, Tensor isect_splats, Tensor tile_offsets, int n_cameras, int width, int height, int "
@@ -153,13 +145,12 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "v_renders, Tensor? v_alphas, SymInt n_cameras, SymInt width, SymInt height, int tile_size, int "
       "tile_begin, int tile_end, bool absgrad, bool deterministic, Tensor(a!)? gradients=None) -> (Tensor "
       "v_means2d, Tensor v_conics, Tensor v_splat_opacities, Tensor v_colors, Tensor v_means2d_abs)");
-  // What follows the projection of a call, in one op. It gives splats the colours of the visible rows of
-  // `gaussians` (means, quats, scales, opacities), whose SH are in parts in `sh`; opacities, radii and
-  // tiles_touched become 0 where a colour is not finite. Then it lists the splats by tile and composites the
-  // channels: `channels` or, without, the colours and, with_depth, the depths. Without gaussians no rows are
-  // gathered. totals: those of the projection, if the splats have spare capacity. Returns isect_splats,
-  // tile_offsets, the outputs of rasterize_fwd, alphas, and with gaussians: colors, the numbers of the rows,
-  // 0 to U - 1, visible_ids as int64, and the rows of the gaussians and of the joined sh.
+  // What follows the projection of a call: colours of the splats from the visible rows of `gaussians` (means,
+  // quats, scales, opacities), whose SH are in parts in `sh`; lists; and compositing of `channels` or,
+  // without, of the colours and, with_depth, the depths. Splats whose colour is not finite are hidden:
+  // opacities, radii and tiles_touched become 0. totals: those of the projection, if the splats have spare
+  // capacity. Returns isect_splats, tile_offsets, the outputs of rasterize_fwd, alphas, and with gaussians:
+  // colors, the numbers of the rows, visible_ids as int64, and the rows of gaussians and joined sh.
   m.def(
       "render(Tensor means2d, Tensor conics, Tensor(a!) splat_opacities, Tensor depths, Tensor camera_ids, "
       "Tensor visible_ids, Tensor splat_offsets, Tensor(b!) radii, Tensor(c!) tiles_touched, Tensor? "
@@ -175,8 +166,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "tile_offsets, int n_cameras, int width, int height, int tile_size, int tile_begin, int tile_end, "
       "Tensor? n_splats=None, bool squares=False) -> (Tensor weights, Tensor pixels, Tensor squares)");
 
-  // For each pixel, or each row that slots name: the final T, the number of composited splats, the one in the
-  // middle of the light, and the strongest with their weights alpha T.
+  // For each pixel, or row that slots name: the final T, the number of splats, the one in the middle of the
+  // light, and the strongest.
   m.def(
       "pixel_splats(Tensor means2d, Tensor conics, Tensor splat_opacities, Tensor isect_splats, Tensor "
       "tile_offsets, Tensor? slots, int n_rows, int n_cameras, int width, int height, int tile_size, int "
@@ -193,8 +184,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "view_sums_(Tensor(a!)[] sums, Tensor[] splats, Tensor weights, Tensor pixels, Tensor counts, int[] "
       "columns, int rule, float eps, float unit) -> ()");
 
-  // L1 and SSIM of the owned tiles. fwd_bwd computes the sums and the gradient in one pass; the weights of
-  // the sums must be known before.
+  // L1 and SSIM of the owned tiles; fwd_bwd computes sums and gradient in one pass.
   m.def(
       "photometric_fwd(Tensor renders, Tensor targets, Tensor? masks, int tile_size, int tile_begin, int "
       "tile_end) -> (Tensor l1_sums, Tensor ssim_sums)");
@@ -220,10 +210,9 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
       "l1_ssim_fwd_bwd(Tensor renders, Tensor targets, Tensor l1_weights, Tensor ssim_weights, Tensor "
       "samples, float l1_factor, float ssim_factor, float offset) -> (Tensor loss, Tensor v_renders)");
 
-  // The optimiser: dense Adam over a list of rows, with the arguments of project_bwd_step_; and the
-  // statistics of density control. ids: int32 [U] or int64 [U] or [1, U]. current: the parameters of the
-  // listed rows (None: all) are at the step before. rates: of a single parameter, they enter the tables
-  // (`RatesArgs`), and taken, float32 [] on the CPU, counts the step.
+  // The optimiser, with the arguments of project_bwd_step_. ids: int32 [U] or int64 [U] or [1, U]. current:
+  // the parameters of the listed rows (None: all) are at the step before. rates: of a single parameter, they
+  // enter the tables (`RatesArgs`), and taken, float32 [] on the CPU, counts the step.
   m.def(
       "lazy_adam_step_(Tensor(a!)[] state, Tensor(b!)[] tables, int step, int explicit_steps, float beta1, "
       "float beta2, float eps, Tensor[] grads, Tensor? ids, bool current=False, float[] rates=[], "
@@ -231,25 +220,21 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   m.def(
       "lazy_adam_catch_up_(Tensor(a!)[] state, Tensor[] tables, int step, int explicit_steps, float beta1, "
       "float beta2, float eps, Tensor? ids, Tensor? count=None) -> ()");
-  // The rules of the total drift of a row, by the step of its parameters; `like` has the dtype of the
-  // parameters.
+  // The rules of the total drift of a row, by the step of its parameters; `like` has their dtype.
   m.def("lazy_adam_final_rules(Tensor table, Tensor like, int explicit_steps, float eps) -> Tensor");
   m.def(
       "density_stats_(Tensor(a!) grad_sum, Tensor(b!) grad_count, Tensor(c!) max_radii, Tensor "
       "visible_ids, Tensor splat_offsets, Tensor v_means2d, Tensor conics, Tensor? phi, int width, int "
       "height, float weight) -> ()");
 
-  // Noise on the means of almost transparent Gaussians.
   m.def(
       "position_noise_(Tensor(a!) means, Tensor quats, Tensor scales, Tensor opacities, Tensor ids, Tensor "
       "visible_ids, int seed, int step, float threshold, float strength) -> ()");
-  // A limit of the size of Gaussians.
   m.def(
       "limit_scales_(Tensor(a!) scales, Tensor means, Tensor visible_ids, float share, float extent) -> ()");
 
-  // Relocation: weights of a draw; the whole draws of each row, and keys for the rest; what N Gaussians at
-  // one place composite; and rows that stand for `copies` Gaussians from now on. moments: Adam's first
-  // moments of all parameters, then the second ones.
+  // Relocation (csrc/population/relocation.h). moments: Adam's first moments of all parameters, then the
+  // second ones.
   m.def("draw_weights(Tensor opacities, Tensor causes) -> Tensor");
   m.def(
       "residual_draws(Tensor weights, Tensor ids, int draws, int total, int seed, int event) -> (Tensor "
@@ -282,8 +267,8 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // The first rows of columns, in the same memory without autograd's knowledge.
   m.def("first_rows(Tensor[] columns, int[] lengths) -> Tensor[]");
 
-  // For a table in the memory of the host with a pool of blocks on the device: the blocks that views may see,
-  // and the exchange of blocks between table and pool. The first n_written columns are written back.
+  // For a table in the host's memory with a pool of blocks on the device (csrc/active/pool.h). The first
+  // n_written columns are written back.
   m.def(
       "seen_blocks(Tensor bounds, Tensor viewmats, Tensor Ks, Tensor sizes, float near_plane, float "
       "far_plane, float eps2d) -> Tensor seen");
@@ -294,8 +279,7 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // Hashes with one more key: a tensor, or a number where it is absent.
   m.def("hash_key(Tensor hashes, Tensor? keys, int number) -> Tensor");
 
-  // Keys that sample without replacement, and the k-th smallest key: counts of keys by a digit of their bits,
-  // the digit that k lies in, and the keys up to the one that was found.
+  // Keys that sample without replacement, and the search for the k-th smallest (csrc/population/columns.h).
   m.def("sampling_keys(Tensor weights, Tensor ids, int seed, int event) -> Tensor");
   m.def("key_histogram(Tensor keys, Tensor prefix, int shift, int width) -> Tensor");
   m.def("find_digit_(Tensor(a!) search, Tensor counts) -> ()");
@@ -304,7 +288,6 @@ STABLE_TORCH_LIBRARY(blitzgs, m) {
   // A number that is 0 if all values of the columns are finite and none of `nonzero` is 0.
   m.def("find_non_finite(Tensor[] columns, Tensor[] nonzero) -> Tensor");
 
-  // Scene initialisation.
   m.def("knn_distances(Tensor points, int k) -> Tensor");
 }
 

@@ -227,7 +227,7 @@ def test_the_compiler_was_given_these_flags():
 def test_one_file_alone_decides_which_gpus_and_sizes_take_which_branch():
     """A build that forces the other branch (CONTRIBUTING.md) forces all of them."""
     branches = re.compile(
-        r"__CUDA_ARCH__\s*[<>=]|__CUDA_ARCH_(LIST|FEAT|SPECIFIC)|<=? \(?(std::int64_t\{1\}|1) << 30"
+        r"__CUDA_ARCH__\s*[<>=]|__CUDA_ARCH_(LIST|FEAT|SPECIFIC)|<=? \(?(int64_t\{1\}|1) << 30"
     )
     files = sorted(path.relative_to(CSRC) for path in CSRC.glob("*/*.*"))
     deciding = [str(file) for file in files if branches.search(source(file))]

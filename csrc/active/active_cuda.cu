@@ -1,13 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
-
 #include "active/pool.h"
 #include "active/view_gate.h"
 #include "common/cuda.cuh"
 #include "exchange/transport.h"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 constexpr int kThreads = 256, kWarps = kThreads / 32;
@@ -21,7 +18,7 @@ __global__ void __launch_bounds__(kThreads) see_blocks(const SeenBlocks args) {
   __shared__ Frustum planes[kMaxViews];
   if (threadIdx.x < args.views) planes[threadIdx.x] = frustum_of(args, threadIdx.x);
   __syncthreads();
-  const std::int64_t block = blockIdx.x * std::int64_t{kThreads} + threadIdx.x;
+  const int64_t block = blockIdx.x * int64_t{kThreads} + threadIdx.x;
   if (block < args.n) args.seen[block] = views_that_see(args, planes, block);
 }
 
@@ -49,25 +46,24 @@ __device__ __forceinline__ void move(uint4* slot, uint4* leaving, const uint4* c
 // one unit at a time, in a loop. units: the number of units in a move.
 __global__ void __launch_bounds__(kThreads) move_blocks(const SwapBlocks swap, int units) {
   const int lane = threadIdx.x % 32;
-  const std::int64_t warps = std::int64_t{gridDim.x} * kWarps;
-  for (std::int64_t i = blockIdx.x * std::int64_t{kWarps} + threadIdx.x / 32; i < swap.n * units;
-       i += warps) {
-    const std::int64_t move_index = i / units;
-    int unit = static_cast<int>(i - move_index * units), c = 0;
-    int words = static_cast<int>(swap.columns[0].bytes / sizeof(uint4));
+  const int64_t warps = int64_t{gridDim.x} * kWarps;
+  for (int64_t i = blockIdx.x * int64_t{kWarps} + threadIdx.x / 32; i < swap.n * units; i += warps) {
+    const int64_t move_index = i / units;
+    int unit = int(i - move_index * units), c = 0;
+    int words = int(swap.columns[0].bytes / sizeof(uint4));
     while (unit * kUnit >= words) {
       unit -= (words + kUnit - 1) / kUnit;
-      words = static_cast<int>(swap.columns[++c].bytes / sizeof(uint4));
+      words = int(swap.columns[++c].bytes / sizeof(uint4));
     }
     const SwapColumn& column = swap.columns[c];
-    const std::int32_t leaving = swap.leaving[move_index], coming = swap.coming[move_index];
-    const std::int64_t first = std::int64_t{unit} * kUnit;
-    const auto at = [&](std::byte* base, std::int64_t block) {
+    const int32_t leaving = swap.leaving[move_index], coming = swap.coming[move_index];
+    const int64_t first = int64_t{unit} * kUnit;
+    const auto at = [&](std::byte* base, int64_t block) {
       return reinterpret_cast<uint4*>(base) + block * words + first;
     };
     move(at(column.pool, swap.slots[move_index]),
          leaving >= 0 && column.is_written ? at(column.table, leaving) : nullptr,
-         coming >= 0 ? at(column.table, coming) : nullptr, lane, words - static_cast<int>(first));
+         coming >= 0 ? at(column.table, coming) : nullptr, lane, words - int(first));
   }
 }
 
@@ -76,25 +72,23 @@ __global__ void __launch_bounds__(kThreads) move_blocks(const SwapBlocks swap, i
 template <bool kToSectors>
 __global__ void __launch_bounds__(kBlockRows) transpose_kernel(const CullMask mask) {
   const int group = threadIdx.x / 32, lane = threadIdx.x % 32;
-  const std::int64_t block = blockIdx.x, row = block * kBlockRows + threadIdx.x;
+  const int64_t block = blockIdx.x, row = block * kBlockRows + threadIdx.x;
   const bool present = row < mask.n;
-  for (std::int64_t word = 0; word < mask.words; ++word) {
-    std::int32_t& row_word = mask.rows[(present ? row : 0) * mask.words + word];
-    std::int32_t& sector_word = mask.sectors[sector_at(block, 32 * mask.words, 32 * word + lane) + group];
+  for (int64_t word = 0; word < mask.words; ++word) {
+    int32_t& row_word = mask.rows[(present ? row : 0) * mask.words + word];
+    int32_t& sector_word = mask.sectors[sector_at(block, 32 * mask.words, 32 * word + lane) + group];
     if (kToSectors) {
-      sector_word = static_cast<std::int32_t>(
-          transpose_bits(present ? static_cast<std::uint32_t>(row_word) : 0u, lane));
+      sector_word = int32_t(transpose_bits(present ? uint32_t(row_word) : 0u, lane));
     } else {
-      const std::uint32_t own = transpose_bits(static_cast<std::uint32_t>(sector_word), lane);
-      if (present) row_word = static_cast<std::int32_t>(own);
+      const uint32_t own = transpose_bits(uint32_t(sector_word), lane);
+      if (present) row_word = int32_t(own);
     }
   }
 }
 
-template <bool kToSectors>
-void transpose(const CullMask& mask, CudaStream stream) {
+template <bool kToSectors> void transpose(const CullMask& mask, CudaStream stream) {
   if (mask.n == 0 || mask.words == 0) return;
-  transpose_kernel<kToSectors><<<static_cast<unsigned>(blocks_of(mask.n)), kBlockRows, 0, stream>>>(mask);
+  transpose_kernel<kToSectors><<<unsigned(blocks_of(mask.n)), kBlockRows, 0, stream>>>(mask);
   check_launch("cull mask");
 }
 
@@ -104,12 +98,12 @@ constexpr int kResident = 6;  // CUDA blocks that fit a multiprocessor of every 
 __global__ void __launch_bounds__(kThreads, kResident) gate_views_kernel(const ViewGateArgs args) {
   __shared__ GateTable table;
   wait_for_earlier_kernels();
-  const std::int64_t count = args.count ? *args.count : args.capacity;
-  const std::int64_t first = blockIdx.x * std::int64_t{kThreads};
+  const int64_t count = args.count ? *args.count : args.capacity;
+  const int64_t first = blockIdx.x * int64_t{kThreads};
   if (first >= count) return;
   fill_gate_table(args.rules, args.viewmats, threadIdx.x, table);
   __syncthreads();
-  for (std::int64_t i = first + threadIdx.x; i < count; i += std::int64_t{kThreads} * gridDim.x) {
+  for (int64_t i = first + threadIdx.x; i < count; i += int64_t{kThreads} * gridDim.x) {
     gate_entry(args, table, i);
   }
 }
@@ -125,23 +119,21 @@ void seen_blocks(const SeenBlocks& args, CudaStream stream) {
 void swap_blocks(const SwapBlocks& given, CudaStream stream) {
   if (given.n == 0 || given.n_columns == 0) return;
   SwapBlocks swap = given;
-  std::int64_t units = 0;
+  int64_t units = 0;
   for (int c = 0; c < swap.n_columns; ++c) {
     SwapColumn& column = swap.columns[c];
-    column.table =
-        reinterpret_cast<std::byte*>(device_address(reinterpret_cast<std::int64_t*>(column.table)));
+    column.table = reinterpret_cast<std::byte*>(device_address(reinterpret_cast<int64_t*>(column.table)));
     const auto places =
         reinterpret_cast<std::uintptr_t>(column.pool) | reinterpret_cast<std::uintptr_t>(column.table);
     if (places % sizeof(uint4) != 0) {
       throw std::runtime_error(
           "blitzgs: columns that blocks move between must begin at multiples of 16 bytes");
     }
-    const std::int64_t words = column.bytes / static_cast<std::int64_t>(sizeof(uint4));
+    const int64_t words = column.bytes / int64_t(sizeof(uint4));
     units += (words + kUnit - 1) / kUnit;
   }
-  const std::int64_t wanted = (swap.n * units + kWarps - 1) / kWarps;
-  move_blocks<<<static_cast<unsigned>(std::min<std::int64_t>(wanted, kBlocks)), kThreads, 0, stream>>>(
-      swap, static_cast<int>(units));
+  const int64_t wanted = (swap.n * units + kWarps - 1) / kWarps;
+  move_blocks<<<unsigned(std::min<int64_t>(wanted, kBlocks)), kThreads, 0, stream>>>(swap, int(units));
   check_launch("swap_blocks");
 }
 

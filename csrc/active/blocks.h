@@ -1,45 +1,38 @@
 // SPDX-License-Identifier: Apache-2.0
-// The active set of a step: the rows of the table that some view may see. The kernels find it without reading
-// most of the other rows.
+// The active set of a step: the rows of the table that some view may see, without reading most others.
 //
 // The table is in Morton order, so consecutive rows are neighbours in space. A block is 256 consecutive rows.
-// The bounds of a block contain every position and every size that its Gaussians can have while steps of the
-// lazy optimiser are pending. A row moves along a straight line while its steps are pending, by at most
-// m / sqrt(v) times the tail of the schedule (lazy_adam.h). Its mean therefore lies in the box of this line,
-// and its log scales between two values.
+// Its bounds contain every position and size that its Gaussians can have while steps of the lazy optimiser
+// are pending: a row then moves along a straight line, by at most m / sqrt(v) times the tail of the schedule
+// (lazy_adam.h), so its mean lies in the box of this line, and its log scales between two values.
 //
 // A box of means with standard deviations up to sigma is dropped from a view iff all its points fail one of
 // the inequalities of the view's frustum (math/frustum.h). Blocks are tested first, then the rows of the
 // remaining blocks, each with the box of its own line. The test of a block has twice the rounding slack, so a
 // row that passes its own test is never dropped with its block, and the result does not depend on how rows
 // are grouped. If the box of a block satisfies all inequalities with sigma = 0 and some slack, all its rows
-// pass without being read. Only the rows of mixed blocks, which lie across a border of a view, are read.
+// pass unread. Only the rows of mixed blocks, which lie across a border of a view, are read.
 //
-// A gate on the views (view_gate.h) drops rows by the same principle: the distances of a box from the camera
-// decide first for blocks and then for rows. A row for which they do not decide stays active; the exact test
-// follows when the row has caught up.
+// A gate on the views (view_gate.h) drops rows by the same principle, by the distances of a box from the
+// camera. A row for which they do not decide stays active; the exact test follows when the row has caught up.
 //
-// The test is conservative: every row that the projection would project is in the set. The cost is O(N / 256
-// + rows of mixed blocks + active rows) per view, the memory O(rows of the blocks that some view may see).
-// The caller gives the capacity in blocks. If more blocks are active, the lists are empty and n_blocks says
-// how large the capacity has to be.
+// The test is conservative: every row that the projection would project is in the set. The cost is
+// O(N / 256 + rows of mixed blocks + active rows) per view, the memory O(rows of the blocks that some view
+// may see). The caller gives a capacity in blocks. If more are active, the lists are empty; n_blocks says so.
 #pragma once
 #include <cfloat>
-#include <cmath>
-#include <cstdint>
 
 #include "active/view_gate.h"
 #include "adam/lazy_adam.h"
-#include "common/kernel.h"
 #include "math/frustum.h"
 
 namespace blitzgs {
 
 constexpr int kBlockBounds = 8;  // lowest corner, highest corner, largest sigma, whether all rows are finite
 
-BLITZGS_HD int rows_in_block(std::int64_t rows, std::int64_t block) {
-  const std::int64_t rest = rows - block * kBlockRows;
-  return static_cast<int>(rest < kBlockRows ? rest : kBlockRows);
+BLITZGS_HD int rows_in_block(int64_t rows, int64_t block) {
+  const int64_t rest = rows - block * kBlockRows;
+  return int(rest < kBlockRows ? rest : kBlockRows);
 }
 
 // The columns of the table that say where rows are and where pending steps may move them. Moments null: no
@@ -47,9 +40,9 @@ BLITZGS_HD int rows_in_block(std::int64_t rows, std::int64_t block) {
 struct BlockRows {
   const float *means, *scales;  // [N, 3], scales logarithmic
   const float *exp_avg_means, *exp_avg_sq_means, *exp_avg_scales, *exp_avg_sq_scales;
-  const std::int32_t *last_step, *moment_step;  // [N], the steps of parameters and moments (lazy_adam.h)
-  const double* table;                          // [S + 1, kAdamTable]
-  std::int64_t n;
+  const int32_t *last_step, *moment_step;  // [N], the steps of parameters and moments (lazy_adam.h)
+  const double* table;                     // [S + 1, kAdamTable]
+  int64_t n;
 };
 
 // A box of means and an upper bound on the standard deviations; empty if low > high.
@@ -66,18 +59,17 @@ BLITZGS_HD float pending_drift(float m, float v, float tail) {
   return m == 0.0f || !(v > 0.0f) ? 0.0f : m / std::sqrt(v) * tail * 1.00001f;
 }
 
-// The box in which a row stays while its steps are pending. A row that is not finite is never visible and has
-// an empty box.
-BLITZGS_HD SweptBox sweep_row(const BlockRows& rows, std::int64_t row) {
+// The box in which a row stays while its steps are pending. That of a row that is not finite is empty.
+BLITZGS_HD SweptBox sweep_row(const BlockRows& rows, int64_t row) {
   SweptBox box = empty_box();
   // All values whose address depends on the row alone are loaded before the first computation, so that a GPU
   // waits once for all of these loads.
   const bool pending = rows.exp_avg_means != nullptr;
-  const std::int32_t stand = pending ? rows.last_step[row] : 0;
-  const std::int32_t behind = pending ? stand - rows.moment_step[row] : 0;
+  const int32_t stand = pending ? rows.last_step[row] : 0;
+  const int32_t behind = pending ? stand - rows.moment_step[row] : 0;
   float mean[3], scale[3], moments[2][3], squares[2][3];
   for (int axis = 0; axis < 3; ++axis) {
-    const std::int64_t at = 3 * row + axis;
+    const int64_t at = 3 * row + axis;
     mean[axis] = rows.means[at], scale[axis] = rows.scales[at];
     moments[0][axis] = pending ? rows.exp_avg_means[at] : 0.0f;
     squares[0][axis] = pending ? rows.exp_avg_sq_means[at] : 0.0f;
@@ -86,10 +78,10 @@ BLITZGS_HD SweptBox sweep_row(const BlockRows& rows, std::int64_t row) {
   }
   float mean_tail = 0.0f, scale_tail = 0.0f;
   if (pending) {
-    const double* entry = rows.table + static_cast<std::int64_t>(stand) * kAdamTable;
-    const double decay = rows.table[static_cast<std::int64_t>(behind) * kAdamTable + kRatioPower];
-    mean_tail = static_cast<float>(decay * entry[kTails]);
-    scale_tail = static_cast<float>(decay * entry[kTails + 2]);
+    const double* entry = rows.table + int64_t(stand) * kAdamTable;
+    const double decay = rows.table[int64_t(behind) * kAdamTable + kRatioPower];
+    mean_tail = float(decay * entry[kTails]);
+    scale_tail = float(decay * entry[kTails + 2]);
   }
   SweptBox swept;
   float largest = -FLT_MAX, check = 0.0f;
@@ -173,7 +165,7 @@ constexpr float kRowSlack = kPointSlack, kBlockSlack = 2 * kPointSlack;
 // if the exact test would drop it wherever it may be. Without rules no row is dropped.
 struct BlockGate {
   GateRules rules;
-  const std::uint8_t* level_ranges;  // [blocks_of(n), 2], coarsest and finest level of each block
+  const uint8_t* level_ranges;  // [blocks_of(n), 2], coarsest and finest level of each block
 };
 
 // Bounds on the squared distances of all points of a box from a camera.
@@ -198,25 +190,25 @@ BLITZGS_HD DistanceRange distances_of(const SweptBox& box, const float* centre, 
 // One bit for each view. any: the view may see a row of the block. inside: the view's frustum certainly
 // contains all rows. all: in addition, neither the LOD gate nor the cull mask drops one of them.
 struct BlockViews {
-  std::uint32_t any, inside, all;
+  uint32_t any, inside, all;
 };
 
 // Removes from `seen` the views in which the gate drops all rows (any) or may drop a row (all).
-BLITZGS_HD void gate_block(const BlockGate& gate, const GateTable& table, std::int64_t block,
-                           const SweptBox& box, BlockViews& seen) {
+BLITZGS_HD void gate_block(const BlockGate& gate, const GateTable& table, int64_t block, const SweptBox& box,
+                           BlockViews& seen) {
   const GateRules& rules = gate.rules;
   const int last = rules.n_levels - 1;
   const int coarsest = gate.level_ranges[2 * block], finest = gate.level_ranges[2 * block + 1];
   for (int view = 0; view < rules.n_views; ++view) {
     if (!has_bit(seen.any & rules.lod_views, view)) continue;
     const DistanceRange range = distances_of(box, table.centres[view], kBlockSlack);
-    const std::uint32_t others = ~(1u << view);
+    const uint32_t others = ~(1u << view);
     if (range.near2 > table.reach2[coarsest < last ? coarsest : last]) seen.any &= others;
     if (!(range.far2 <= table.reach2[finest < last ? finest : last])) seen.all &= others;
   }
   for (int view = 0; view < rules.n_views; ++view) {
     if (!has_bit(seen.any & rules.cull_views, view)) continue;
-    const std::int64_t sector = sector_at(block, rules.cull_columns, table.columns[view]);
+    const int64_t sector = sector_at(block, rules.cull_columns, table.columns[view]);
     const SectorBits culled = sector_bits(rules.cull + sector, rows_in_block(rules.n_rows, block));
     if (culled.all) seen.any &= ~(1u << view);
     if (culled.any) seen.all &= ~(1u << view);
@@ -227,7 +219,7 @@ BLITZGS_HD void gate_block(const BlockGate& gate, const GateTable& table, std::i
 
 // The test of a block from its bounds [kBlockBounds].
 template <bool kGated>
-BLITZGS_HD BlockViews views_of_block(const Frustum* views, int count, const float* bounds, std::int64_t block,
+BLITZGS_HD BlockViews views_of_block(const Frustum* views, int count, const float* bounds, int64_t block,
                                      const BlockGate& gate, const GateTable& table) {
   const SweptBox box = load_box(bounds + block * kBlockBounds);
   BlockViews result{0, 0, 0};
@@ -248,10 +240,10 @@ BLITZGS_HD bool is_mixed(const BlockViews& block) { return block.any != block.al
 // The views that may see a row of a mixed block, as bits. The row's columns are read only if the bounds of
 // its block do not decide.
 template <bool kGated>
-BLITZGS_HD std::uint32_t views_of_row(const BlockRows& rows, const Frustum* views, int count,
-                                      const float* bounds, const BlockViews& seen, std::int64_t row,
-                                      const BlockGate& gate, const GateTable& table) {
-  std::uint32_t mask = seen.any, by_level = 0;
+BLITZGS_HD uint32_t views_of_row(const BlockRows& rows, const Frustum* views, int count, const float* bounds,
+                                 const BlockViews& seen, int64_t row, const BlockGate& gate,
+                                 const GateTable& table) {
+  uint32_t mask = seen.any, by_level = 0;
   float reach2 = 0.0f;
   if (kGated) {
     mask &= ~views_that_cull(gate.rules, table, row, mask);
@@ -269,7 +261,7 @@ BLITZGS_HD std::uint32_t views_of_row(const BlockRows& rows, const Frustum* view
       }
     }
   }
-  const std::uint32_t by_frustum = mask & ~seen.inside;
+  const uint32_t by_frustum = mask & ~seen.inside;
   if (!(by_frustum | by_level)) return mask;
   const SweptBox box = sweep_row(rows, row);
   for (int view = 0; view < count; ++view) {
@@ -282,24 +274,22 @@ BLITZGS_HD std::uint32_t views_of_row(const BlockRows& rows, const Frustum* view
   return mask;
 }
 
-// A block that some view may see.
 struct alignas(16) ActiveBlock {
-  std::int32_t block;
+  int32_t block;
   BlockViews seen;
 };
 
-// The result of the tests, from which the rows are listed. The lists have a capacity of capacity_blocks
-// blocks.
+// The result of the tests, from which the rows are listed, for at most capacity_blocks blocks.
 struct CullPlan {
-  ActiveBlock* blocks;   // the blocks that some view may see, in order
-  std::uint32_t* masks;  // [blocks, kBlockRows], the views that may see each row of a mixed block, as bits
-  std::int32_t* active;  // the number of active rows of each block
-  std::int64_t capacity_blocks;
+  ActiveBlock* blocks;  // the blocks that some view may see, in order
+  uint32_t* masks;      // [blocks, kBlockRows], the views that may see each row of a mixed block, as bits
+  int32_t* active;      // the number of active rows of each block
+  int64_t capacity_blocks;
 
-  CullPlan(std::int64_t n_blocks, Workspace& workspace)
+  CullPlan(int64_t n_blocks, Workspace& workspace)
       : blocks(workspace.allocate<ActiveBlock>(n_blocks)),
-        masks(workspace.allocate<std::uint32_t>(n_blocks * kBlockRows)),
-        active(workspace.allocate<std::int32_t>(n_blocks)),
+        masks(workspace.allocate<uint32_t>(n_blocks * kBlockRows)),
+        active(workspace.allocate<int32_t>(n_blocks)),
         capacity_blocks(n_blocks) {}
 };
 
@@ -307,11 +297,10 @@ struct CullPlan {
 // of which the first *count entries are valid. *n_blocks is the number of blocks that some view may see; if
 // it exceeds `capacity_blocks`, *count is 0.
 struct ActiveList {
-  std::int32_t *ids, *views, *count, *n_blocks;  // [capacity_blocks * kBlockRows] twice, [1] twice
-  std::int64_t capacity_blocks;
+  int32_t *ids, *views, *count, *n_blocks;  // [capacity_blocks * kBlockRows] twice, [1] twice
+  int64_t capacity_blocks;
 };
 
-// The inputs of the test: the rows, the bounds of their blocks, the views and the gate.
 struct CullInputs {
   BlockRows rows;
   const float* bounds;
@@ -323,12 +312,12 @@ struct CullInputs {
 namespace BLITZGS_BACKEND {
 // keys [n]: the Morton codes (math/morton.h) of points [n, 3], without their lowest bit so that they fit a
 // signed integer. A table whose rows are in this order has neighbours in space in neighbouring rows.
-void morton_keys(const float* points, std::int64_t n, std::int64_t* keys, Workspace&, CudaStream);
+void morton_keys(const float* points, int64_t n, int64_t* keys, Workspace&, CudaStream);
 // Computes the bounds of the blocks that contain the rows `ids`, or of all blocks if ids is null.
-void update_block_bounds(const BlockRows& rows, const std::int32_t* ids, std::int64_t n_ids, float* bounds,
-                         Workspace&, CudaStream);
+void update_block_bounds(const BlockRows& rows, const int32_t* ids, int64_t n_ids, float* bounds, Workspace&,
+                         CudaStream);
 // Waits for the number of blocks that some view may see.
-std::int64_t count_active_blocks(const CullInputs&, Workspace&, CudaStream);
+int64_t count_active_blocks(const CullInputs&, Workspace&, CudaStream);
 void cull_blocks(const CullInputs&, const ActiveList&, Workspace&, CudaStream);
 }  // namespace BLITZGS_BACKEND
 

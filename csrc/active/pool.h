@@ -5,11 +5,7 @@
 //
 // A block is 256 consecutive rows (active/blocks.h). A slot is the memory of one block in the pool.
 #pragma once
-#include <cstddef>
-#include <cstdint>
-
 #include "active/blocks.h"
-#include "common/kernel.h"
 
 namespace blitzgs {
 
@@ -22,18 +18,18 @@ constexpr float kSeenSlack = 2 * kBlockSlack;
 // bit is set. Each view has its own image size.
 struct SeenBlocks {
   const float* bounds;
-  std::int64_t n;
+  int64_t n;
   const float *viewmats, *Ks;  // [V, 4, 4], [V, 3, 3]
-  const std::int32_t* sizes;   // [V, 2], width and height in pixels
+  const int32_t* sizes;        // [V, 2], width and height in pixels
   int views;                   // at most kMaxViews
   float near_plane, far_plane, eps2d;
-  std::int32_t* seen;
+  int32_t* seen;
 };
 
 // One column of the pool and of the table, with `bytes` bytes per block.
 struct SwapColumn {
   std::byte *pool, *table;
-  std::int64_t bytes;
+  int64_t bytes;
   bool is_written;  // whether blocks that leave are written back
 };
 
@@ -46,19 +42,19 @@ struct SwapColumn {
 // itself. The old and the new contents of a slot use both directions of the bus at the same time, and one
 // launch is enough for any number of blocks and columns.
 struct SwapBlocks {
-  const std::int32_t *slots, *leaving, *coming;  // [n]
-  std::int64_t n;
+  const int32_t *slots, *leaving, *coming;  // [n]
+  int64_t n;
   SwapColumn columns[kMaxSwapColumns];
   int n_columns;
 };
 
-BLITZGS_HD std::int32_t views_that_see(const SeenBlocks& args, const Frustum* planes, std::int64_t block) {
+BLITZGS_HD int32_t views_that_see(const SeenBlocks& args, const Frustum* planes, int64_t block) {
   const SweptBox box = load_box(args.bounds + block * kBlockBounds);
-  std::uint32_t seen = 0;
+  uint32_t seen = 0;
   for (int view = 0; view < args.views; ++view) {
     if (visibility_of(planes[view], box, kSeenSlack).any) seen |= 1u << view;
   }
-  return static_cast<std::int32_t>(seen);
+  return int32_t(seen);
 }
 
 BLITZGS_HD Frustum frustum_of(const SeenBlocks& args, int view) {

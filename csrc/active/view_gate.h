@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // What views leave out of the active rows: the cull mask and its layouts, the LOD gate, and the op of both.
 #pragma once
-#include <cstdint>
-
 #include "common/kernel.h"
 
 // The cull mask has a bit for each row of a table and each column (a training view), in two layouts:
@@ -21,18 +19,16 @@ namespace blitzgs {
 constexpr int kBlockRows = 256;                // rows of a block of the table
 constexpr int kSectorWords = kBlockRows / 32;  // words of a sector
 
-BLITZGS_HD std::int64_t blocks_of(std::int64_t rows) { return (rows + kBlockRows - 1) / kBlockRows; }
+BLITZGS_HD int64_t blocks_of(int64_t rows) { return (rows + kBlockRows - 1) / kBlockRows; }
 
-// The position of the sector of a block and a column, in a mask of n_columns columns.
-BLITZGS_HD std::int64_t sector_at(std::int64_t block, std::int64_t n_columns, std::int64_t column) {
+BLITZGS_HD int64_t sector_at(int64_t block, int64_t n_columns, int64_t column) {
   return (block * n_columns + column) * kSectorWords;
 }
 
-BLITZGS_HD bool sector_bit(const std::int32_t* sectors, std::int64_t n_columns, std::int64_t column,
-                           std::int64_t row) {
-  const int local = static_cast<int>(row % kBlockRows);
-  const std::int32_t word = sectors[sector_at(row / kBlockRows, n_columns, column) + local / 32];
-  return (static_cast<std::uint32_t>(word) >> local % 32 & 1u) != 0;
+BLITZGS_HD bool sector_bit(const int32_t* sectors, int64_t n_columns, int64_t column, int64_t row) {
+  const int local = int(row % kBlockRows);
+  const int32_t word = sectors[sector_at(row / kBlockRows, n_columns, column) + local / 32];
+  return (uint32_t(word) >> local % 32 & 1u) != 0;
 }
 
 // Whether any, and whether all, of the first `count` rows of a sector have the bit.
@@ -40,12 +36,12 @@ struct SectorBits {
   bool any, all;
 };
 
-BLITZGS_HD SectorBits sector_bits(const std::int32_t* sector, int count) {
+BLITZGS_HD SectorBits sector_bits(const int32_t* sector, int count) {
   SectorBits bits{false, true};
   for (int word = 0; word < kSectorWords; ++word) {
     const int live = count - 32 * word;
-    const std::uint32_t rows = live >= 32 ? ~0u : live > 0 ? (1u << live) - 1u : 0u;
-    const std::uint32_t set = static_cast<std::uint32_t>(sector[word]) & rows;
+    const uint32_t rows = live >= 32 ? ~0u : live > 0 ? (1u << live) - 1u : 0u;
+    const uint32_t set = uint32_t(sector[word]) & rows;
     bits.any |= set != 0;
     bits.all &= set == rows;
   }
@@ -54,14 +50,9 @@ BLITZGS_HD SectorBits sector_bits(const std::int32_t* sector, int count) {
 
 // The two layouts of a mask of n rows and 32 * words columns.
 struct CullMask {
-  std::int32_t *rows, *sectors;
-  std::int64_t n, words;
+  int32_t *rows, *sectors;
+  int64_t n, words;
 };
-
-namespace BLITZGS_BACKEND {
-void sectors_of_rows(const CullMask&, CudaStream);
-void rows_of_sectors(const CullMask&, CudaStream);
-}  // namespace BLITZGS_BACKEND
 
 // The view level (BlitzGS, section 3.3; levels as in Octree-GS, Ren et al. 2024): drops pairs of a row and a
 // view from the active set before the projection.
@@ -71,40 +62,39 @@ void rows_of_sectors(const CullMask&, CudaStream);
 // level 0 at any distance, and a level beyond L_max(t) nowhere (reach < 0). Comparing squared distances
 // decides the same sets without a logarithm.
 //
-// Cull mask: view v drops row i iff the row's bit in column columns[v] of the cull matrix is set. The matrix
-// is stored by sector.
+// Cull mask: view v drops row i iff its bit in column columns[v] of the cull matrix, by sector, is set.
 //
 // The op clears the bits of dropped pairs in `views`, in place. The decision for a row depends on this row
 // alone, in float32 and from caught-up means, so the sets depend neither on the order of the rows nor on how
-// they are divided among ranks. One thread handles a row: deterministic. The cost is O(listed rows).
+// they are divided among ranks. The cost is O(listed rows).
 
 // The values that the rows of a launch are compared with, by view or by level.
 struct GateTable {
   float centres[kMaxViews][3];
-  float reach2[kMaxLevels];         // squared; negative: the level is kept nowhere
-  std::int32_t columns[kMaxViews];  // columns of the cull matrix; negative: the view has no mask
+  float reach2[kMaxLevels];    // squared; negative: the level is kept nowhere
+  int32_t columns[kMaxViews];  // columns of the cull matrix; negative: the view has no mask
 };
 
 // The rules by which rows of a table are dropped from B views.
 struct GateRules {
-  const std::uint8_t* level;  // [N]
-  const std::int32_t* cull;   // [blocks_of(N), cull_columns, kSectorWords]; may be null
-  std::int64_t n_rows, cull_columns;
+  const uint8_t* level;  // [N]
+  const int32_t* cull;   // [blocks_of(N), cull_columns, kSectorWords]; may be null
+  int64_t n_rows, cull_columns;
   int n_views, n_levels;
-  std::uint32_t lod_views;   // bits of the views that have an LOD gate
-  std::uint32_t cull_views;  // bits of the views that have a mask
-  GateTable table;           // without the centres, which the kernels compute
+  uint32_t lod_views;   // bits of the views that have an LOD gate
+  uint32_t cull_views;  // bits of the views that have a mask
+  GateTable table;      // without the centres, which the kernels compute
 };
 
 BLITZGS_HD bool leaves_out_any(const GateRules& rules) { return (rules.lod_views | rules.cull_views) != 0; }
 
 struct ViewGateArgs {
-  const std::int32_t* ids;  // [capacity]
-  std::int32_t* views;      // [capacity]
-  std::int64_t capacity;
-  const std::int32_t* count;  // CUDA: the number of valid ids, in device memory; null: all
-  const float* means;         // [N, 3]
-  const float* viewmats;      // [B, 4, 4], rigid
+  const int32_t* ids;  // [capacity]
+  int32_t* views;      // [capacity]
+  int64_t capacity;
+  const int32_t* count;   // CUDA: the number of valid ids, in device memory; null: all
+  const float* means;     // [N, 3]
+  const float* viewmats;  // [B, 4, 4], rigid
   GateRules rules;
 };
 
@@ -112,10 +102,8 @@ struct ViewGateArgs {
 BLITZGS_HD void camera_centre(const float* viewmat, float* centre) {
   for (int axis = 0; axis < 3; ++axis) {
     double sum = 0;
-    for (int i = 0; i < 3; ++i) {
-      sum -= static_cast<double>(viewmat[4 * i + axis]) * static_cast<double>(viewmat[4 * i + 3]);
-    }
-    centre[axis] = static_cast<float>(sum);
+    for (int i = 0; i < 3; ++i) sum -= double(viewmat[4 * i + axis]) * double(viewmat[4 * i + 3]);
+    centre[axis] = float(sum);
   }
 }
 
@@ -125,17 +113,16 @@ BLITZGS_HD float squared_distance(const float* a, const float* b) {
   return sum;
 }
 
-BLITZGS_HD bool has_bit(std::uint32_t bits, int index) { return (bits >> index & 1u) != 0; }
+BLITZGS_HD bool has_bit(uint32_t bits, int index) { return (bits >> index & 1u) != 0; }
 
-BLITZGS_HD float reach2_of(const GateRules& rules, const GateTable& table, std::int64_t row) {
+BLITZGS_HD float reach2_of(const GateRules& rules, const GateTable& table, int64_t row) {
   const int level = rules.level[row], last = rules.n_levels - 1;
   return table.reach2[level < last ? level : last];
 }
 
-// The views of `seen` whose masks drop a row.
-BLITZGS_HD std::uint32_t views_that_cull(const GateRules& rules, const GateTable& table, std::int64_t row,
-                                         std::uint32_t seen) {
-  std::uint32_t culled = 0;
+BLITZGS_HD uint32_t views_that_cull(const GateRules& rules, const GateTable& table, int64_t row,
+                                    uint32_t seen) {
+  uint32_t culled = 0;
   if (!(seen & rules.cull_views)) return culled;
   for (int view = 0; view < rules.n_views; ++view) {
     if (!has_bit(seen & rules.cull_views, view)) continue;
@@ -144,12 +131,11 @@ BLITZGS_HD std::uint32_t views_that_cull(const GateRules& rules, const GateTable
   return culled;
 }
 
-// Applies the gate to entry i of the list.
-BLITZGS_HD void gate_entry(const ViewGateArgs& args, const GateTable& table, std::int64_t i) {
+BLITZGS_HD void gate_entry(const ViewGateArgs& args, const GateTable& table, int64_t i) {
   const GateRules& rules = args.rules;
-  const std::int64_t row = args.ids[i];
-  const auto seen = static_cast<std::uint32_t>(args.views[i]);
-  std::uint32_t kept = seen & ~views_that_cull(rules, table, row, seen);
+  const int64_t row = args.ids[i];
+  const auto seen = uint32_t(args.views[i]);
+  uint32_t kept = seen & ~views_that_cull(rules, table, row, seen);
   if (kept & rules.lod_views) {
     const float reach2 = reach2_of(rules, table, row);
     for (int view = 0; view < rules.n_views; ++view) {
@@ -157,15 +143,10 @@ BLITZGS_HD void gate_entry(const ViewGateArgs& args, const GateTable& table, std
       if (squared_distance(args.means + 3 * row, table.centres[view]) > reach2) kept &= ~(1u << view);
     }
   }
-  if (kept != seen) args.views[i] = static_cast<std::int32_t>(kept);
+  if (kept != seen) args.views[i] = int32_t(kept);
 }
 
-namespace BLITZGS_BACKEND {
-void gate_views(const ViewGateArgs&, CudaStream);
-}  // namespace BLITZGS_BACKEND
-
-// Fills `table` with the table of the rules and the camera centres. All threads of a block call this, each
-// for one level and one view.
+// Fills `table` with the table of the rules and the camera centres. Each thread does a level and a view.
 BLITZGS_HD void fill_gate_table(const GateRules& rules, const float* viewmats, int thread, GateTable& table) {
   if (thread < kMaxLevels) table.reach2[thread] = rules.table.reach2[thread];
   if (thread < rules.n_views) {
@@ -173,5 +154,11 @@ BLITZGS_HD void fill_gate_table(const GateRules& rules, const float* viewmats, i
     camera_centre(viewmats + 16 * thread, table.centres[thread]);
   }
 }
+
+namespace BLITZGS_BACKEND {
+void sectors_of_rows(const CullMask&, CudaStream);
+void rows_of_sectors(const CullMask&, CudaStream);
+void gate_views(const ViewGateArgs&, CudaStream);
+}  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

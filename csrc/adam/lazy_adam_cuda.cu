@@ -1,29 +1,21 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
-#include <stdexcept>
-#include <type_traits>
-
 #include "adam/lazy_adam_device.cuh"
 #include "adam/position_noise.h"
 #include "adam/scale_limit.h"
-#include "common/cuda.cuh"
 #include "common/rows.h"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 // The lazy optimiser (lazy_adam.h) on CUDA. Catching up takes three kernels: prepare computes the rules and
 // list_pending_rows lists the rows with pending steps (lazy_adam_device.cuh), and catch_up_kernel moves their
-// parameters. step_kernel then takes the step with gradients. A parameter that is stepped alone has kernels
-// of its own.
+// parameters. step_kernel takes the step with gradients. A parameter stepped alone has its own.
 
 // A row with SH degree 3 has 12 packs of four SH coefficients, one quaternion and seven more numbers; each of
 // these gets a thread.
 constexpr int kRows = 16;  // rows per block
 constexpr int kThreads = kRows * (12 + 8);
-// With three SH values a row (the first coefficient, stepped without the others) a block has threads for more
-// rows.
+// With three SH values a row (the first coefficient alone) a block has threads for more rows.
 constexpr int kFewPacks = 3, kMoreRows = kThreads / (kFewPacks + 8);
 constexpr int kCatchUpBlocks = 4, kListBlocks = 8;  // per multiprocessor
 constexpr int kAlone = kAdamColumns - 1;            // the column of a parameter that is stepped alone
@@ -58,7 +50,7 @@ __device__ __forceinline__ void catch_up_pack(const AdamArgs<float>& args, const
                                               const PendingRow& row, int pack) {
   using P = Pack<Width>;
   const AdamColumn<float>& column = args.columns[Column];
-  const std::int64_t at = row.id * column.width + pack * Width;
+  const int64_t at = row.id * column.width + pack * Width;
   P p = *reinterpret_cast<const P*>(column.param + at);
   const P m = *reinterpret_cast<const P*>(column.exp_avg + at);
   const P v = *reinterpret_cast<const P*>(column.exp_avg_sq + at);
@@ -68,7 +60,7 @@ __device__ __forceinline__ void catch_up_pack(const AdamArgs<float>& args, const
 #pragma unroll
   for (int j = 0; j < Width; ++j) {
     p.x[j] -= adam_ruled_drift(j < Width - 1 ? first : last, m.x[j] * row.here.first,
-                               adam_root(v.x[j] * row.here.second), static_cast<float>(args.eps));
+                               adam_root(v.x[j] * row.here.second), float(args.eps));
   }
   *reinterpret_cast<P*>(column.param + at) = p;
 }
@@ -81,10 +73,10 @@ __global__ void __launch_bounds__(kThreads, kCatchUpBlocks)
                     const PendingRow* pending_rows) {
   wait_for_earlier_kernels();
   if (!*prepared.any_pending) return;
-  const std::int64_t n = listed(args);
+  const int64_t n = listed(args);
   const auto catch_up_one = [&]<int Column, int Width>(int local, int pack) {
-    const std::int64_t stride = gridDim.x * std::int64_t{Rows};
-    std::int64_t i = blockIdx.x * std::int64_t{Rows} + local;
+    const int64_t stride = gridDim.x * int64_t{Rows};
+    int64_t i = blockIdx.x * int64_t{Rows} + local;
     PendingRow next{-1, 0, {}};
     if (i < n) next = pending_rows[i];
     while (i < n) {
@@ -94,13 +86,13 @@ __global__ void __launch_bounds__(kThreads, kCatchUpBlocks)
       if (row.id >= 0) catch_up_pack<Column, Width>(args, prepared, row, pack);
     }
   };
-  for_each_pack<ShWidth, ShPacks, Rows>(static_cast<int>(args.columns[4].width) / ShWidth, catch_up_one);
+  for_each_pack<ShWidth, ShPacks, Rows>(int(args.columns[4].width) / ShWidth, catch_up_one);
 }
 
 // One pack of a row takes the Adam step; the row has caught up.
 template <int Column, int Width>
 __device__ __forceinline__ void step_pack(const AdamArgs<float>& args, const AdamStep<float>& step,
-                                          std::int64_t row, std::int64_t list_row, int pack) {
+                                          int64_t row, int64_t list_row, int pack) {
   const AdamColumn<float>& column = args.columns[Column];
   StepPack<Column, Width> own;
   own.load(column, row, pack);
@@ -116,17 +108,17 @@ __global__ void __launch_bounds__(kThreads) step_kernel(const __grid_constant__ 
   wait_for_earlier_kernels();
   if (threadIdx.x == 0) step = adam_step_scalars(args);
   __syncthreads();
-  const std::int64_t first = blockIdx.x * std::int64_t{Rows};
-  const int count = static_cast<int>(args.n - first < Rows ? args.n - first : Rows);
+  const int64_t first = blockIdx.x * int64_t{Rows};
+  const int count = int(args.n - first < Rows ? args.n - first : Rows);
   const auto take_step = [&]<int Column, int Width>(int local, int pack) {
     if (local >= count) return;
-    const std::int64_t row = args.row(first + local);
+    const int64_t row = args.row(first + local);
     step_pack<Column, Width>(args, step, row, first + local, pack);
   };
-  for_each_pack<ShWidth, ShPacks, Rows>(static_cast<int>(args.columns[4].width) / ShWidth, take_step);
+  for_each_pack<ShWidth, ShPacks, Rows>(int(args.columns[4].width) / ShWidth, take_step);
   __syncthreads();
   if (threadIdx.x >= count) return;
-  const std::int64_t i = first + threadIdx.x, row = args.row(i);
+  const int64_t i = first + threadIdx.x, row = args.row(i);
   args.last_step[row] = args.step;
   args.moment_step[row] = args.step;
 }
@@ -143,17 +135,17 @@ __global__ void __launch_bounds__(kListThreads)
   const bool takes_step = args.with_gradient();
   if (takes_step && threadIdx.x == 0) step = adam_step_scalars(args);
   __syncthreads();
-  const std::int64_t n = listed(args), stride = gridDim.x * std::int64_t{block_rows};
-  for (std::int64_t first = blockIdx.x * std::int64_t{block_rows}; first < n; first += stride) {
-    const auto count = static_cast<unsigned>(n - first < block_rows ? n - first : block_rows),
-               width = static_cast<unsigned>(column.width);
+  const int64_t n = listed(args), stride = gridDim.x * int64_t{block_rows};
+  for (int64_t first = blockIdx.x * int64_t{block_rows}; first < n; first += stride) {
+    const auto count = unsigned(n - first < block_rows ? n - first : block_rows),
+               width = unsigned(column.width);
     for (unsigned e = threadIdx.x; e < count * width; e += kListThreads) {
       const unsigned j = e % width;
-      const std::int64_t row = args.row(first + e / width), at = row * column.width + j;
-      const std::int32_t from = args.last_step[row], stand = args.moment_step[row];
+      const int64_t row = args.row(first + e / width), at = row * column.width + j;
+      const int32_t from = args.last_step[row], stand = args.moment_step[row];
       const bool moves = prepared.decays && adam_moves(args, from, stand);
       if (!moves && !takes_step) continue;
-      const int group = adam_group(kAlone, static_cast<int>(j));
+      const int group = adam_group(kAlone, int(j));
       float p = column.param[at], m = column.exp_avg[at], v = column.exp_avg_sq[at];
       if (moves) {
         const Decay here = prepared.decays[from - stand];
@@ -171,13 +163,13 @@ __global__ void __launch_bounds__(kListThreads)
     }
     __syncthreads();
     for (unsigned i = threadIdx.x; i < count; i += kListThreads) {
-      const std::int64_t row = args.row(first + i);
+      const int64_t row = args.row(first + i);
       if (args.last_step[row] < args.step) args.last_step[row] = args.step;
       if (takes_step) args.moment_step[row] = args.step;
     }
   }
-  for (int item = static_cast<int>(blockIdx.x * kListThreads + threadIdx.x);
-       item < args.rates.reach() * kAdamOrders; item += static_cast<int>(gridDim.x) * kListThreads) {
+  for (int item = int(blockIdx.x * kListThreads + threadIdx.x); item < args.rates.reach() * kAdamOrders;
+       item += int(gridDim.x) * kListThreads) {
     const int back = item / kAdamOrders + 1, order = item % kAdamOrders;
     enter_rate(args.rates, back, order, std::pow(args.rates.ratio_of(order), back));
   }
@@ -188,7 +180,7 @@ bool is_alone(const AdamArgs<float>& args) { return args.columns[0].width == 0; 
 // Selects a kernel by the number of SH values in a row: 48 (degree 3), 3 (degree 0) or another.
 template <class Kernel>
 Kernel* select(const AdamArgs<float>& args, Kernel* degree_3, Kernel* degree_0, Kernel* any) {
-  const std::int64_t width = args.columns[4].width;
+  const int64_t width = args.columns[4].width;
   return width == 48 ? degree_3 : width == kFewPacks ? degree_0 : any;
 }
 
@@ -200,8 +192,8 @@ int rows_per_block(const AdamArgs<float>& args) {
 Prepared prepare_rules(const AdamArgs<float>& args, Workspace& workspace, CudaStream stream) {
   // Rows whose moments are explicit_steps or more before last_step do not move (adam_moves), so longer decays
   // are not needed.
-  const std::int32_t first = args.final_rules ? std::max(0, args.step - args.explicit_steps + 1) : 0,
-                     n_decays = std::min(args.step + 1, args.explicit_steps);
+  const int32_t first = args.final_rules ? std::max(0, args.step - args.explicit_steps + 1) : 0,
+                n_decays = std::min(args.step + 1, args.explicit_steps);
   const Prepared prepared{workspace.allocate<PendingSteps<float>>(args.step - first),
                           workspace.allocate<Decay>(n_decays),
                           workspace.allocate<bool>(1),
@@ -246,21 +238,20 @@ void check_alignment(const AdamArgs<float>& args) {
 
 }  // namespace
 
-template <class T>
-void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream) {
+template <class T> void lazy_adam(const AdamArgs<T>& args, Workspace& workspace, CudaStream stream) {
   static_assert(std::is_same_v<T, float>);
   AdamArgs<float> behind = args;
   behind.step = args.target();
   for (AdamColumn<float>& column : behind.columns) column.grad = nullptr;
   const bool catches_up = !args.current && behind.step > 0 && args.n > 0;
   if (is_alone(args)) {
-    const std::int64_t width = std::clamp<std::int64_t>(args.columns[kAlone].width, 1, kListThreads);
-    const auto block_rows = static_cast<int>(kListThreads / width);
+    const int64_t width = std::clamp<int64_t>(args.columns[kAlone].width, 1, kListThreads);
+    const auto block_rows = int(kListThreads / width);
     const Prepared prepared = catches_up ? prepare_rules(behind, workspace, stream) : Prepared{};
     launch_early(
         "lazy_adam of one parameter", alone_kernel,
-        {resident_blocks(std::max<std::int64_t>(args.n, 1), block_rows, kListBlocks), kListThreads, stream},
-        args, prepared, block_rows);
+        {resident_blocks(std::max<int64_t>(args.n, 1), block_rows, kListBlocks), kListThreads, stream}, args,
+        prepared, block_rows);
     return;
   }
   if (args.n == 0) return;

@@ -2,8 +2,6 @@
 // The Adam step of a few elements of a row, for step_kernel (lazy_adam_cuda.cu) and for the projection's
 // backward pass that takes the step (project_step_cuda.cu).
 #pragma once
-#include <cstdint>
-
 #include "adam/lazy_adam.h"
 #include "common/cuda.cuh"
 
@@ -14,32 +12,29 @@ struct Decay {
   float first, second;
 };
 
-__device__ inline Decay make_decay(const AdamArgs<float>& args, std::int32_t steps) {
+__device__ inline Decay make_decay(const AdamArgs<float>& args, int32_t steps) {
   const double* row = args.table_row(steps);
-  return {static_cast<float>(row[kBeta1Power]), static_cast<float>(row[kBeta2Power])};
+  return {float(row[kBeta1Power]), float(row[kBeta2Power])};
 }
 
 // Width floats that one instruction loads or stores.
-template <int Width>
-struct alignas(4 * Width) Pack {
+template <int Width> struct alignas(4 * Width) Pack {
   float x[Width];
 };
 
 // The learning-rate group of an element of a pack. In a pack that spans two groups, only the last element is
 // in the second one.
-template <int Column, int Width>
-__device__ constexpr int pack_group(int pack, int element) {
+template <int Column, int Width> __device__ constexpr int pack_group(int pack, int element) {
   return adam_group(Column, pack * Width + (element < Width - 1 ? 0 : element));
 }
 
 // The Adam step of Width elements of a row of a column. load() and finish() are separate, so that a thread
 // can have the loads of several packs in flight.
-template <int Column, int Width>
-class StepPack {
+template <int Column, int Width> class StepPack {
  public:
   using P = Pack<Width>;
 
-  __device__ __forceinline__ void load(const AdamColumn<float>& column, std::int64_t row, int pack) {
+  __device__ __forceinline__ void load(const AdamColumn<float>& column, int64_t row, int pack) {
     pack_ = pack;
     at_ = row * column.width + pack * Width;
     p_ = *reinterpret_cast<const P*>(column.param + at_);
@@ -61,7 +56,7 @@ class StepPack {
 
  private:
   P p_, m_, v_;
-  std::int64_t at_;
+  int64_t at_;
   int pack_;
 };
 
@@ -79,9 +74,9 @@ struct Prepared {
   Decay* decays;                 // [n_decays], the decay of the moments over i steps
   bool* any_pending;             // whether any row has pending steps
   const PendingSteps<float>* final_rules;  // for parameters at the steps before `first`
-  std::int32_t first, n_decays;
+  int32_t first, n_decays;
 
-  __device__ const PendingSteps<float>& of(std::int32_t from) const {
+  __device__ const PendingSteps<float>& of(int32_t from) const {
     return from < first ? final_rules[from] : pending[from - first];
   }
 };
@@ -91,8 +86,8 @@ struct Prepared {
 static __global__ void __launch_bounds__(kPrepareThreads)
     prepare(const __grid_constant__ AdamArgs<float> args, const Prepared prepared) {
   wait_for_earlier_kernels();
-  const auto thread = static_cast<std::int32_t>(blockIdx.x * kPrepareThreads + threadIdx.x);
-  const std::int32_t i = thread / kPrepareLanes, t = prepared.first + i, target = args.target();
+  const auto thread = int32_t(blockIdx.x * kPrepareThreads + threadIdx.x);
+  const int32_t i = thread / kPrepareLanes, t = prepared.first + i, target = args.target();
   const int group = thread % kPrepareLanes;
   if (thread == 0) *prepared.any_pending = false;
   if (i < prepared.n_decays && group == kPrepareLanes - 1) prepared.decays[i] = make_decay(args, i);
@@ -110,21 +105,20 @@ static __global__ void __launch_bounds__(kPrepareThreads)
   steps.explicit_up_to = adam_explicit_up_to(args, t, target, error);
 }
 
-// A row with pending steps.
 struct alignas(16) PendingRow {
-  std::int32_t id;    // -1: the row has no pending steps, or has taken them already
-  std::int32_t from;  // the step of its parameters
-  Decay here;         // the decay of its moments up to that step
+  int32_t id;    // -1: the row has no pending steps, or has taken them already
+  int32_t from;  // the step of its parameters
+  Decay here;    // the decay of its moments up to that step
 };
 
 // One column of a row catches up if the rules are not exact enough for all its elements. All lanes of the
 // warp call this, each for some elements of the row.
 template <int Column>
 __device__ void catch_up_elements(const AdamArgs<float>& args, const PendingSteps<float>& steps,
-                                  const Decay& here, std::int64_t row) {
+                                  const Decay& here, int64_t row) {
   const AdamColumn<float>& column = args.columns[Column];
   for (int j = threadIdx.x % 32; j < column.width; j += 32) {
-    const std::int64_t at = row * column.width + j;
+    const int64_t at = row * column.width + j;
     column.param[at] -= adam_drift(args, steps, adam_group(Column, j), column.exp_avg[at] * here.first,
                                    column.exp_avg_sq[at] * here.second);
   }
@@ -132,7 +126,7 @@ __device__ void catch_up_elements(const AdamArgs<float>& args, const PendingStep
 
 // The number of valid rows in the list. A count above n says that the caller had too little room for the list
 // and will repeat its work; the n rows that are there are valid.
-__device__ inline std::int64_t listed(const AdamArgs<float>& args) {
+__device__ inline int64_t listed(const AdamArgs<float>& args) {
   return args.count && *args.count < args.n ? *args.count : args.n;
 }
 
@@ -143,15 +137,15 @@ static __global__ void __launch_bounds__(kListThreads)
     list_pending_rows(const __grid_constant__ AdamArgs<float> args, const Prepared prepared,
                       PendingRow* pending_rows) {
   wait_for_earlier_kernels();
-  const std::int64_t n = listed(args);
-  for (std::int64_t first = blockIdx.x * std::int64_t{kListThreads}; first < n;
-       first += gridDim.x * std::int64_t{kListThreads}) {
-    const std::int64_t i = first + threadIdx.x;
+  const int64_t n = listed(args);
+  for (int64_t first = blockIdx.x * int64_t{kListThreads}; first < n;
+       first += gridDim.x * int64_t{kListThreads}) {
+    const int64_t i = first + threadIdx.x;
     PendingRow mine{-1, 0, {}};
     bool explicitly = false;
     if (i < n) {
-      const std::int32_t row = static_cast<std::int32_t>(args.row(i));
-      const std::int32_t from = args.last_step[row], stand = args.moment_step[row];
+      const int32_t row = int32_t(args.row(i));
+      const int32_t from = args.last_step[row], stand = args.moment_step[row];
       if (adam_moves(args, from, stand)) {
         mine = {row, from, prepared.decays[from - stand]};
         explicitly = prepared.of(from).explicit_up_to >= 0;
@@ -160,7 +154,7 @@ static __global__ void __launch_bounds__(kListThreads)
     }
     for (unsigned left = __ballot_sync(kFullWarp, explicitly); left; left &= left - 1) {
       const int lane = __ffs(left) - 1;
-      const std::int64_t row = __shfl_sync(kFullWarp, mine.id, lane);
+      const int64_t row = __shfl_sync(kFullWarp, mine.id, lane);
       const PendingSteps<float>& steps = prepared.of(__shfl_sync(kFullWarp, mine.from, lane));
       const Decay here{__shfl_sync(kFullWarp, mine.here.first, lane),
                        __shfl_sync(kFullWarp, mine.here.second, lane)};

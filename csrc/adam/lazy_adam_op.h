@@ -10,13 +10,11 @@ namespace blitzgs {
 
 inline constexpr const char* kAdamNames[kAdamColumns] = {"means", "quats", "scales", "opacities", "sh"};
 
-// The number of tensors in a state: parameters, first and second moments of each column; last_step,
-// moment_step.
-inline constexpr std::size_t kAdamState = 3 * kAdamColumns + 2, kAloneState = 3 + 2;
+// The tensors of a state: each column's parameter, first and second moment; last_step, moment_step.
+inline constexpr size_t kAdamState = 3 * kAdamColumns + 2, kAloneState = 3 + 2;
 
-// What the ops that move parameters take beside tensors.
 struct AdamConstants {
-  std::int64_t step, explicit_steps;
+  int64_t step, explicit_steps;
   double beta1, beta2, eps;
 };
 
@@ -56,7 +54,7 @@ struct AdamTensors {
 
   const Tensor& like() const { return params[0]; }
   const char* name(int column) const { return alone ? "the parameter" : kAdamNames[column]; }
-  std::int64_t rows() const { return like().size(0); }
+  int64_t rows() const { return like().size(0); }
 
   // Checks a list of rows, int32 [n] or int64 [n] or [1, n] (as sparse tensors have them); none: all rows.
   OptionalTensor checked_rows(const OptionalTensor& ids) const {
@@ -67,33 +65,31 @@ struct AdamTensors {
     return checked("ids", *ids, is_long ? ScalarType::Long : ScalarType::Int, {-1});
   }
 
-  // The kernel's arguments for the rows of a list (`checked_rows`). Gradients are null; the caller sets
-  // them.
-  template <class T>
-  AdamArgs<T> arguments(const OptionalTensor& ids) {
+  // The kernel's arguments for the rows of a list (`checked_rows`). The caller sets gradients.
+  template <class T> AdamArgs<T> arguments(const OptionalTensor& ids) {
     AdamArgs<T> args{};
     for (int c = 0; c < count(); ++c) {
       args.columns[first() + c] = {mutable_data<T>(params[c]), mutable_data<T>(exp_avgs[c]),
                                    mutable_data<T>(exp_avg_sqs[c]), nullptr, width(c)};
     }
     if (ids && ids->scalar_type() == ScalarType::Long) {
-      args.long_ids = data<std::int64_t>(*ids);
+      args.long_ids = data<int64_t>(*ids);
     } else {
-      args.ids = data_or_null<std::int32_t>(ids);
+      args.ids = data_or_null<int32_t>(ids);
     }
     args.n = ids ? ids->numel() : rows();
-    args.last_step = mutable_data<std::int32_t>(last_step);
-    args.moment_step = mutable_data<std::int32_t>(moment_step);
+    args.last_step = mutable_data<int32_t>(last_step);
+    args.moment_step = mutable_data<int32_t>(moment_step);
     args.table = data<double>(table);
     args.lr_table = data<float>(lr_table);
     if (final_rules) {
-      const auto bytes = checked_in_place<std::uint8_t>(
+      const auto bytes = checked_in_place<uint8_t>(
           "final_rules", *final_rules,
           {final_rules_of(table.size(0), constants.explicit_steps), sizeof(PendingSteps<T>)});
       args.final_rules = reinterpret_cast<const PendingSteps<T>*>(bytes.data());
     }
-    args.step = static_cast<std::int32_t>(constants.step);
-    args.explicit_steps = static_cast<std::int32_t>(constants.explicit_steps);
+    args.step = int32_t(constants.step);
+    args.explicit_steps = int32_t(constants.explicit_steps);
     args.beta1 = constants.beta1;
     args.beta2 = constants.beta2;
     args.eps = constants.eps;
@@ -104,7 +100,7 @@ struct AdamTensors {
     BLITZGS_CHECK(constants.step >= 1, "steps count from 1, got ", constants.step);
   }
 
-  std::int64_t width(int column) const { return rows() ? params[column].numel() / rows() : 0; }
+  int64_t width(int column) const { return rows() ? params[column].numel() / rows() : 0; }
 
  private:
   void check() const {
@@ -125,7 +121,7 @@ struct AdamTensors {
     check_in_place("moment_step", moment_step, ScalarType::Int, {rows()});
     check_in_place("table", table, ScalarType::Double, {-1, kAdamTable});
     check_in_place("lr_table", lr_table, ScalarType::Float, {table.size(0), kAdamGroups});
-    const std::int64_t step = constants.step;
+    const int64_t step = constants.step;
     BLITZGS_CHECK(step >= 0 && step < table.size(0), "step ", step,
                   " is outside the learning-rate table, which ends at step ", table.size(0) - 1);
   }

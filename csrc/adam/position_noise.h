@@ -16,9 +16,6 @@
 // means [N, 3], quats [N, 4], scales [N, 3] (log), opacities [N] (logit), ids int64 [N], visible_ids int32
 // [U] (each row once). strength has the unit of an inverse length.
 #pragma once
-#include <cstdint>
-
-#include "common/kernel.h"
 #include "math/counter_random.h"
 #include "math/gaussian.h"
 
@@ -27,37 +24,33 @@ namespace blitzgs {
 constexpr double kGateSlope = 100;
 constexpr double kLeastGate = 0x1p-24;
 // The key that makes these draws differ from other draws of the same id and seed.
-constexpr std::int64_t kPositionNoise = 1;
+constexpr int64_t kPositionNoise = 1;
 
-template <class T>
-struct PositionNoise {
+template <class T> struct PositionNoise {
   T* means;            // [N, 3]
   const T* quats;      // [N, 4]
   const T* scales;     // [N, 3]
   const T* opacities;  // [N]
-  const std::int64_t* ids;
-  const std::int32_t* visible_ids;
-  std::int64_t n;
-  std::int64_t seed, step;
+  const int64_t* ids;
+  const int32_t* visible_ids;
+  int64_t n;
+  int64_t seed, step;
   double threshold, strength;
 
-  BLITZGS_HD void operator()(std::int64_t u) const {
-    const std::int64_t row = visible_ids[u];
-    const double opacity = sigmoid(static_cast<double>(opacities[row]));
+  BLITZGS_HD void operator()(int64_t u) const {
+    const int64_t row = visible_ids[u];
+    const double opacity = sigmoid(double(opacities[row]));
     const double gate = sigmoid(kGateSlope * (threshold - opacity));
     if (!(gate >= kLeastGate)) return;
     const Columns3<T> rotation = rotation_columns(normalize_quaternion(quats + 4 * row));
     const Vec3<T> log_scale = load3(scales + 3 * row);
     const Columns3<T> axes =
         scaled_axes(rotation, Vec3<T>{std::exp(log_scale.x), std::exp(log_scale.y), std::exp(log_scale.z)});
-    std::uint64_t hash = 0;
-    for (const std::int64_t key : {ids[row], seed, kPositionNoise, step}) {
-      hash = hash_key(hash, key);
-    }
-    const Vec3<T> draw = {static_cast<T>(normal_of(hash_key(hash, 0))),
-                          static_cast<T>(normal_of(hash_key(hash, 1))),
-                          static_cast<T>(normal_of(hash_key(hash, 2)))};
-    const T factor = static_cast<T>(strength * gate);
+    uint64_t hash = 0;
+    for (const int64_t key : {ids[row], seed, kPositionNoise, step}) hash = hash_key(hash, key);
+    const Vec3<T> draw = {T(normal_of(hash_key(hash, 0))), T(normal_of(hash_key(hash, 1))),
+                          T(normal_of(hash_key(hash, 2)))};
+    const T factor = T(strength * gate);
     const Vec3<T> moved =
         load3(means + 3 * row) +
         factor * (dot(axes.x, draw) * axes.x + dot(axes.y, draw) * axes.y + dot(axes.z, draw) * axes.z);

@@ -11,24 +11,19 @@
 // means [N, 3], with the middle of the cameras at the origin; scales [N, 3] (log); visible_ids int32 [U]
 // (each row once). The scales are updated in place, one thread per row: deterministic. The cost is O(U).
 #pragma once
-#include <cmath>
-#include <cstdint>
-
-#include "common/kernel.h"
 #include "math/vec.h"
 
 namespace blitzgs {
 
-template <class T>
-struct ScaleLimit {
+template <class T> struct ScaleLimit {
   T* scales;       // [N, 3]
   const T* means;  // [N, 3]
-  const std::int32_t* visible_ids;
-  std::int64_t n;
+  const int32_t* visible_ids;
+  int64_t n;
   T share, extent;
 
-  BLITZGS_HD void operator()(std::int64_t u) const {
-    const std::int64_t row = visible_ids[u];
+  BLITZGS_HD void operator()(int64_t u) const {
+    const int64_t row = visible_ids[u];
     const Vec3<T> mean = load3(means + 3 * row);
     const T distance = std::sqrt(dot(mean, mean));
     const T limit = std::log(share * (distance > extent ? distance : extent));

@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
 // How this library was built: for `blitzgs doctor`, and for tests, which branches of cuda.cuh it takes.
-#include <cuda_runtime.h>
 
 #include "common/cuda.cuh"
 
@@ -14,8 +13,7 @@ extern "C" {
 // Returns the version of CUDA and the GPUs (cmake/cuda.cmake).
 __attribute__((visibility("default"))) const char* blitzgs_cuda_build() { return BLITZGS_CUDA_BUILD; }
 
-// Returns 1 if the code that the current device runs has the branches for sm_90, otherwise 0; -1 without a
-// device.
+// Returns whether the code that the current device runs has the branches for sm_90; -1 without a device.
 __attribute__((visibility("default"))) int blitzgs_sm90_branches() {
   int answer = -1;
   return cudaMemcpyFromSymbol(&answer, sm90_branches, sizeof(answer)) == cudaSuccess ? answer : -1;
@@ -25,8 +23,6 @@ __attribute__((visibility("default"))) int blitzgs_sm90_branches() {
 __attribute__((visibility("default"))) int blitzgs_sm80_forced() { return BLITZGS_SM80_BRANCHES; }
 
 // Returns the number of items from which sorts take 64-bit states.
-__attribute__((visibility("default"))) std::int64_t blitzgs_small_states() {
-  return blitzgs::cuda::kSmallStates;
-}
+__attribute__((visibility("default"))) int64_t blitzgs_small_states() { return blitzgs::cuda::kSmallStates; }
 
 }  // extern "C"

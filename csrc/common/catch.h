@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // What the tests that run without torch share. Catch2 v2 and v3 define their macros in different headers.
 #pragma once
-#include <cstddef>
-#include <cstdint>
 #include <memory>
 #include <vector>
 
@@ -17,15 +15,14 @@ using Catch::Approx;
 namespace blitzgs {
 
 // Deterministic noise: 16 bits.
-inline std::uint32_t next_random(std::uint32_t& state) {
+inline uint32_t next_random(uint32_t& state) {
   state = state * 1664525u + 1013904223u;
   return state >> 16;
 }
 
-// Scratch memory of the kernels.
 class TestWorkspace final : public Workspace {
  public:
-  void* allocate_bytes(std::size_t bytes) override {
+  void* allocate_bytes(size_t bytes) override {
     // Allocations have exactly the requested length, so that AddressSanitizer notices the first byte beyond.
     held_.push_back(std::make_unique<std::byte[]>(bytes));
     return held_.back().get();

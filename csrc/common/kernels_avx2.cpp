@@ -8,8 +8,8 @@ namespace blitzgs::cpu {
 
 AdamRowUpdate<float> avx2_adam_row_update() { return update_row<float>; }
 
-void photometric_strips_avx2(const PhotometricArgs<float>& args, const std::int64_t* strips,
-                             std::int64_t begin, std::int64_t end, double* sums) {
+void photometric_strips_avx2(const PhotometricArgs<float>& args, const int64_t* strips, int64_t begin,
+                             int64_t end, double* sums) {
   run_photometric_strips(args, strips, begin, end, sums);
 }
 

@@ -1,7 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
 #include <thread>
-#include <vector>
 
 #include "common/parallel.h"
 
@@ -9,16 +7,11 @@ namespace blitzgs {
 
 int num_threads() { return 2; }
 
-void parallel_for_impl(std::int64_t begin, std::int64_t end, std::int64_t grain, RangeFunction function,
-                       void* context) {
-  const std::int64_t count = end - begin;
-  const std::int64_t chunk =
-      std::max<std::int64_t>(std::max<std::int64_t>(grain, 1), (count + num_threads() - 1) / num_threads());
-  std::vector<std::thread> threads;
-  for (std::int64_t b = begin; b < end; b += chunk) {
-    threads.emplace_back(function, b, std::min(b + chunk, end), context);
-  }
-  for (auto& thread : threads) thread.join();
+void parallel_for_impl(int64_t begin, int64_t end, int64_t, RangeFunction function, void* context) {
+  const int64_t middle = begin + (end - begin) / 2;
+  std::thread first(function, begin, middle, context);
+  function(middle, end, context);
+  first.join();
 }
 
 }  // namespace blitzgs

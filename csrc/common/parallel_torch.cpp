@@ -5,12 +5,11 @@
 
 namespace blitzgs {
 
-void parallel_for_impl(std::int64_t begin, std::int64_t end, std::int64_t grain, RangeFunction function,
-                       void* context) {
-  torch::stable::parallel_for(
-      begin, end, grain, [function, context](std::int64_t b, std::int64_t e) { function(b, e, context); });
+void parallel_for_impl(int64_t begin, int64_t end, int64_t grain, RangeFunction function, void* context) {
+  torch::stable::parallel_for(begin, end, grain,
+                              [function, context](int64_t b, int64_t e) { function(b, e, context); });
 }
 
-int num_threads() { return static_cast<int>(torch::stable::get_num_threads()); }
+int num_threads() { return int(torch::stable::get_num_threads()); }
 
 }  // namespace blitzgs

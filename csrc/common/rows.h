@@ -2,7 +2,6 @@
 // Work on rows that do not know each other: a struct with the number n of rows, whose operator() does the
 // work of row i. For CUDA, a kernel file of the struct's folder instantiates for_each_row.
 #pragma once
-
 #include "common/kernel.h"
 #include "common/parallel.h"
 #ifdef __CUDACC__
@@ -18,7 +17,7 @@ void for_each_row(const Rows& work, CudaStream)
     ;
 #else
 {
-  parallel_rows(work.n, 4096, [&](std::int64_t i) { work(i); });
+  parallel_rows(work.n, 4096, [&](int64_t i) { work(i); });
 }
 #endif
 
@@ -29,16 +28,14 @@ namespace blitzgs::cuda {
 
 inline constexpr int kRowThreads = 256;
 
-// One thread per row.
 template <class Rows>
 static __global__ void __launch_bounds__(kRowThreads) row_kernel(const __grid_constant__ Rows work) {
   wait_for_earlier_kernels();
-  const std::int64_t i = blockIdx.x * std::int64_t{kRowThreads} + threadIdx.x;
+  const int64_t i = blockIdx.x * int64_t{kRowThreads} + threadIdx.x;
   if (i < work.n) work(i);
 }
 
-template <class Rows>
-void for_each_row(const Rows& work, CudaStream stream) {
+template <class Rows> void for_each_row(const Rows& work, CudaStream stream) {
   if (work.n == 0) return;
   launch_early("rows", row_kernel<Rows>, {blocks_for(work.n, kRowThreads), kRowThreads, stream}, work);
 }

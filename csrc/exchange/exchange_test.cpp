@@ -1,6 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <vector>
-
 #include "common/catch.h"
 #include "exchange/scatter.h"
 #include "exchange/tile_costs.h"
@@ -9,9 +7,9 @@ using namespace blitzgs;
 
 namespace {
 
-SplatGroups make_groups(const std::vector<std::int64_t>& sizes) {
+SplatGroups make_groups(const std::vector<int64_t>& sizes) {
   SplatGroups groups{};
-  for (const std::int64_t size : sizes) {
+  for (const int64_t size : sizes) {
     const int m = groups.count++;
     groups.size[m] = size;
     groups.start[m] = m ? groups.start[m - 1] + groups.size[m - 1] : 0;
@@ -23,16 +21,16 @@ SplatGroups make_groups(const std::vector<std::int64_t>& sizes) {
 
 TEST_CASE("scattered splats arrive in order, and their sums return", "[scatter]") {
   const int n = 9000, n_ranks = 3;  // more than one chunk
-  std::vector<std::int32_t> a(2 * n), b(n);
-  std::vector<std::int64_t> masks(n), sizes(n_ranks);
+  std::vector<int32_t> a(2 * n), b(n);
+  std::vector<int64_t> masks(n), sizes(n_ranks);
   for (int i = 0; i < n; ++i) {
     a[2 * i] = i, a[2 * i + 1] = -i, b[i] = 7 * i;
     masks[i] = (i % 2 ? 1 : 0) | (i % 5 ? 0 : 4);  // rank 1 gets nothing, some splats go nowhere
     for (int m = 0; m < n_ranks; ++m) sizes[m] += (masks[i] >> m) & 1;
   }
   const SplatGroups groups = make_groups(sizes);
-  const std::int64_t total = groups.start[2] + groups.size[2];
-  std::vector<std::int32_t> packed(3 * total);
+  const int64_t total = groups.start[2] + groups.size[2];
+  std::vector<int32_t> packed(3 * total);
   std::vector<SplatPlace> places(place_runs(n) * n_ranks);
   ScatterTargets targets{};
   for (int m = 0; m < n_ranks; ++m) {
@@ -43,9 +41,9 @@ TEST_CASE("scattered splats arrive in order, and their sums return", "[scatter]"
   cpu::scatter({{{a.data(), b.data()}, {0, 2, 3}, 2}, masks.data(), n}, groups, targets, places.data(),
                workspace, nullptr);
 
-  std::vector<std::int32_t> a2(2 * total), b2(total);
+  std::vector<int32_t> a2(2 * total), b2(total);
   cpu::gather(packed.data(), groups, {{a2.data(), b2.data()}, {0, 2, 3}, 2}, nullptr);
-  std::size_t at = 0;
+  size_t at = 0;
   for (int m = 0; m < n_ranks; ++m) {
     for (int i = 0; i < n; ++i) {
       if (((masks[i] >> m) & 1) == 0) continue;
@@ -56,7 +54,7 @@ TEST_CASE("scattered splats arrive in order, and their sums return", "[scatter]"
   REQUIRE(at == b2.size());
 
   std::vector<double> values(3 * total), x(n, -1.0), y(2 * n, -1.0);
-  for (std::int64_t i = 0; i < total; ++i) {
+  for (int64_t i = 0; i < total; ++i) {
     const double weight = i < groups.start[2] ? 1.0 : 10.0;
     values[3 * i] = weight * b2[i];
     values[3 * i + 1] = weight;
@@ -76,9 +74,9 @@ TEST_CASE("scattered splats arrive in order, and their sums return", "[scatter]"
 }
 
 TEST_CASE("splats beyond a group's size are dropped", "[scatter]") {
-  const std::int32_t column[4] = {1, 2, 3, 4};
-  const std::int64_t masks[4] = {1, 1, 1, 1};
-  std::int32_t packed[4] = {-1, -1, -1, -1};
+  const int32_t column[4] = {1, 2, 3, 4};
+  const int64_t masks[4] = {1, 1, 1, 1};
+  int32_t packed[4] = {-1, -1, -1, -1};
   SplatPlace place;
   ScatterTargets targets{};
   targets.words[0][0] = packed;
@@ -91,11 +89,11 @@ TEST_CASE("splats beyond a group's size are dropped", "[scatter]") {
 TEST_CASE("pieces spread over their tiles", "[tile_costs]") {
   // Two views of five tiles in pieces of two: costs 8 + 8 twice, 8 + 0 twice and 8 + 1016 once. A view
   // without costs of its own has those of the similar view.
-  const std::uint16_t coarse[] = {0x4800, 0, 0x63f0}, fine[] = {0x4800, 0x4800, 0, 0, 0x63f0};
-  const std::uint16_t *pieces[] = {coarse, coarse}, *guessed[] = {nullptr, coarse}, *tiles[] = {fine, fine};
+  const uint16_t coarse[] = {0x4800, 0, 0x63f0}, fine[] = {0x4800, 0x4800, 0, 0, 0x63f0};
+  const uint16_t *pieces[] = {coarse, coarse}, *guessed[] = {nullptr, coarse}, *tiles[] = {fine, fine};
   TestWorkspace workspace;
-  for (std::int64_t parts = 1; parts < 12; ++parts) {
-    std::vector<std::int64_t> a(parts + 1), b(parts + 1), c(parts + 1);
+  for (int64_t parts = 1; parts < 12; ++parts) {
+    std::vector<int64_t> a(parts + 1), b(parts + 1), c(parts + 1);
     cpu::divide_tiles({pieces, 2, nullptr, 0, 5, 2, 8}, parts, workspace, a.data());
     cpu::divide_tiles({guessed, 2, pieces, 1, 5, 2, 8}, parts, workspace, b.data());
     cpu::divide_tiles({tiles, 2, nullptr, 0, 5, 1, 8}, parts, workspace, c.data());

@@ -14,17 +14,15 @@
 //
 // The cost is O(words moved). Splats beyond the given size of a group are dropped, whatever the masks say.
 #pragma once
-#include <cstdint>
-
 #include "common/kernel.h"
 
 namespace blitzgs {
 
 constexpr int kPlaceSplats = 32;
 
-inline std::int64_t place_runs(std::int64_t splats) { return (splats + kPlaceSplats - 1) / kPlaceSplats; }
+inline int64_t place_runs(int64_t splats) { return (splats + kPlaceSplats - 1) / kPlaceSplats; }
 
-BLITZGS_HD int count_bits(std::uint32_t bits) {
+BLITZGS_HD int count_bits(uint32_t bits) {
 #ifdef __CUDA_ARCH__
   return __popc(bits);
 #else
@@ -34,25 +32,19 @@ BLITZGS_HD int count_bits(std::uint32_t bits) {
 
 // The splats of a run (of kPlaceSplats consecutive ones) that went to one rank. The ops pass it as an int64.
 struct alignas(8) SplatPlace {
-  std::int32_t first;  // the position of the first of them in the rank's group
-  std::uint32_t bits;  // bit i: splat i of the run is one of them
+  int32_t first;  // the position of the first of them in the rank's group
+  uint32_t bits;  // bit i: splat i of the run is one of them
 
   // splat: the index in the run, in [0, kPlaceSplats).
-  BLITZGS_HD bool has(std::uint32_t splat) const { return (bits >> splat) & 1u; }
-  BLITZGS_HD std::int64_t of(std::uint32_t splat) const {
-    return first + count_bits(bits & ((1u << splat) - 1u));
-  }
+  BLITZGS_HD bool has(uint32_t splat) const { return (bits >> splat) & 1u; }
+  BLITZGS_HD int64_t of(uint32_t splat) const { return first + count_bits(bits & ((1u << splat) - 1u)); }
 };
 
 constexpr int kScatterBlock = 256;
 constexpr int kMaxSplatColumns = 8;
 
-inline std::int64_t scatter_blocks(std::int64_t splats) {
-  return (splats + kScatterBlock - 1) / kScatterBlock;
-}
-
 // bits != 0.
-BLITZGS_HD int lowest_bit(std::uint64_t bits) {
+BLITZGS_HD int lowest_bit(uint64_t bits) {
 #ifdef __CUDA_ARCH__
   return __ffsll(static_cast<long long>(bits)) - 1;
 #else
@@ -62,8 +54,7 @@ BLITZGS_HD int lowest_bit(std::uint64_t bits) {
 
 // The columns of some splats. begin: the offset of each column in a splat, in words; the last entry is the
 // number of words in a splat.
-template <class Word>
-struct SplatColumns {
+template <class Word> struct SplatColumns {
   Word* data[kMaxSplatColumns];
   int begin[kMaxSplatColumns + 1];
   int count;
@@ -71,46 +62,41 @@ struct SplatColumns {
 
 // The number of splats in each of M groups, and the number of splats in the groups before it.
 struct SplatGroups {
-  std::int64_t size[kMaxRanks], start[kMaxRanks];
+  int64_t size[kMaxRanks], start[kMaxRanks];
   int count;
 };
 
-// The address of each column of each rank's group.
 struct ScatterTargets {
-  std::int32_t* words[kMaxRanks][kMaxSplatColumns];
+  int32_t* words[kMaxRanks][kMaxSplatColumns];
 };
 
-// The splats to scatter.
 struct ScatterSplats {
-  SplatColumns<const std::int32_t> columns;
-  const std::int64_t* masks;
-  std::int64_t count;
+  SplatColumns<const int32_t> columns;
+  const int64_t* masks;
+  int64_t count;
 };
 
 // Values of the splats that went to each rank: `size` rows of `width` values.
-template <class T>
-struct SplatValues {
+template <class T> struct SplatValues {
   const T* values[kMaxRanks];
-  std::int64_t size[kMaxRanks];
+  int64_t size[kMaxRanks];
   int n_ranks, width;
-  std::int64_t count;        // the splats of this rank
+  int64_t count;             // the splats of this rank
   const SplatPlace* places;  // where in each rank's rows they are
 
   // Calls f(pointer to the splat's values from a rank) for each rank that the splat went to, in order.
-  template <class F>
-  BLITZGS_HD void for_each(std::uint64_t splat, const F& f) const {
+  template <class F> BLITZGS_HD void for_each(uint64_t splat, const F& f) const {
     const SplatPlace* run = places + splat / kPlaceSplats * n_ranks;
-    const auto in_run = static_cast<std::uint32_t>(splat % kPlaceSplats);
-    std::uint64_t ranks = 0;
+    const auto in_run = uint32_t(splat % kPlaceSplats);
+    uint64_t ranks = 0;
 #ifdef __CUDA_ARCH__
 #pragma unroll 4  // four loads at a time; the compiler would choose 16
 #endif
-    for (int m = 0; m < n_ranks; ++m) ranks |= std::uint64_t{run[m].has(in_run)} << m;
-    // Most splats went to a single rank. With this loop the threads of a warp load their first values
-    // together.
+    for (int m = 0; m < n_ranks; ++m) ranks |= uint64_t{run[m].has(in_run)} << m;
+    // Most splats went to a single rank. So the threads of a warp load first values together.
     for (; ranks != 0; ranks &= ranks - 1) {
       const int m = lowest_bit(ranks);
-      const std::int64_t at = run[m].of(in_run);
+      const int64_t at = run[m].of(in_run);
       if (at < size[m]) f(values[m] + at * width);
     }
   }
@@ -119,9 +105,8 @@ struct SplatValues {
 namespace BLITZGS_BACKEND {
 void scatter(const ScatterSplats&, const SplatGroups&, const ScatterTargets&, SplatPlace* places, Workspace&,
              CudaStream);
-void gather(const std::int32_t* packed, const SplatGroups&, const SplatColumns<std::int32_t>&, CudaStream);
-template <class T>
-void sum(const SplatValues<T>&, const SplatColumns<T>&, CudaStream);
+void gather(const int32_t* packed, const SplatGroups&, const SplatColumns<int32_t>&, CudaStream);
+template <class T> void sum(const SplatValues<T>&, const SplatColumns<T>&, CudaStream);
 }  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

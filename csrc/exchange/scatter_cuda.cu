@@ -1,11 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
-
-#include "common/cuda.cuh"
 #include "exchange/scatter_device.cuh"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 // The values of a splat that a thread sums: all 9 of a splat with three colour channels, or up to 16 of more.
@@ -22,14 +18,14 @@ __global__ void __launch_bounds__(kScatterBlock)
                    const __grid_constant__ ScatterTargets targets, const ScatterState state) {
   // One struct, so that the addresses of all its arrays come from one register.
   __shared__ struct {
-    std::uint8_t lists[RANKS][kScatterBlock];  // the block's splats that go to each rank, ascending
-    int before[RANKS][kScatterWarps];          // how many of them come before each warp
-    int counts[RANKS], bases[RANKS];           // those that fit the group, and the first one's position
+    uint8_t lists[RANKS][kScatterBlock];  // the block's splats that go to each rank, ascending
+    int before[RANKS][kScatterWarps];     // how many of them come before each warp
+    int counts[RANKS], bases[RANKS];      // those that fit the group, and the first one's position
   } block;
   const int n_ranks = groups.count, slot = threadIdx.x, warp = slot / 32, lane = slot % 32;
-  const SplatColumns<const std::int32_t>& columns = splats.columns;
-  const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kScatterBlock);
-  const std::int64_t mask = first + slot < splats.count ? splats.masks[first + slot] : 0;
+  const SplatColumns<const int32_t>& columns = splats.columns;
+  const int64_t first = blockIdx.x * int64_t(kScatterBlock);
+  const int64_t mask = first + slot < splats.count ? splats.masks[first + slot] : 0;
   for (int m = 0; m < n_ranks; ++m) {
     const unsigned going = __ballot_sync(kFullWarp, (mask >> m) & 1);
     if (lane == 0) block.before[m][warp] = __popc(going);
@@ -43,16 +39,16 @@ __global__ void __launch_bounds__(kScatterBlock)
       splats_of_warp = sum;
       sum += count;
     }
-    const std::int64_t base = state.take(slot, sum), left = groups.size[slot] - base;
-    block.bases[slot] = static_cast<int>(base);
-    block.counts[slot] = left >= sum ? sum : left > 0 ? static_cast<int>(left) : 0;
+    const int64_t base = state.take(slot, sum), left = groups.size[slot] - base;
+    block.bases[slot] = int(base);
+    block.counts[slot] = left >= sum ? sum : left > 0 ? int(left) : 0;
   }
   __syncthreads();
   for (int m = 0; m < n_ranks; ++m) {
     const bool goes = (mask >> m) & 1;
     const unsigned going = __ballot_sync(kFullWarp, goes);
     const int before = block.before[m][warp];
-    if (goes) block.lists[m][before + __popc(going & ((1u << lane) - 1u))] = static_cast<std::uint8_t>(slot);
+    if (goes) block.lists[m][before + __popc(going & ((1u << lane) - 1u))] = uint8_t(slot);
     if (lane == 0 && first + slot < splats.count) {
       state.places[(first + slot) / kPlaceSplats * n_ranks + m] = {block.bases[m] + before, going};
     }
@@ -62,23 +58,21 @@ __global__ void __launch_bounds__(kScatterBlock)
     const int m = run / columns.count, c = run - m * columns.count;
     const int width = columns.begin[c + 1] - columns.begin[c];
     copy_run(columns.data[c] + first * width, block.lists[m], block.counts[m], width,
-             targets.words[m][c] + std::int64_t{block.bases[m]} * width);
+             targets.words[m][c] + int64_t{block.bases[m]} * width);
   }
 }
 
 // The gather of splats (scatter.h): block (x, y) copies a part of column y % columns.count of group
 // y / columns.count, one thread per word.
-__global__ void gather_kernel(const std::int32_t* packed, const __grid_constant__ SplatGroups groups,
-                              const SplatColumns<std::int32_t> columns) {
+__global__ void gather_kernel(const int32_t* packed, const __grid_constant__ SplatGroups groups,
+                              const SplatColumns<int32_t> columns) {
   const int m = blockIdx.y / columns.count, c = blockIdx.y % columns.count;
-  const std::int64_t width = columns.begin[c + 1] - columns.begin[c];
-  const std::int32_t* from =
+  const int64_t width = columns.begin[c + 1] - columns.begin[c];
+  const int32_t* from =
       packed + groups.start[m] * columns.begin[columns.count] + groups.size[m] * columns.begin[c];
-  std::int32_t* to = columns.data[c] + groups.start[m] * width;
-  const std::int64_t n = groups.size[m] * width, step = static_cast<std::int64_t>(gridDim.x) * blockDim.x;
-  for (std::int64_t i = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x; i < n; i += step) {
-    to[i] = from[i];
-  }
+  int32_t* to = columns.data[c] + groups.start[m] * width;
+  const int64_t n = groups.size[m] * width, step = int64_t(gridDim.x) * blockDim.x;
+  for (int64_t i = blockIdx.x * int64_t(blockDim.x) + threadIdx.x; i < n; i += step) to[i] = from[i];
 }
 
 // Writes `any_part` values of each splat from shared memory (PITCH floats per splat) to columns with
@@ -100,10 +94,10 @@ __global__ void __launch_bounds__(kSumThreads) sum_kernel(const __grid_constant_
                                                           const __grid_constant__ SplatColumns<float> out) {
   constexpr int kPitch = VALUES | 1;  // odd: the same value of different splats lies in different banks
   __shared__ float sums[kSumThreads * kPitch];
-  const int value = ALL ? 0 : VALUES * static_cast<int>(blockIdx.y);
+  const int value = ALL ? 0 : VALUES * int(blockIdx.y);
   const int n_values = ALL ? VALUES : min(VALUES, in.width - value);
-  const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kSumThreads);
-  const std::int64_t splat = first + threadIdx.x;
+  const int64_t first = blockIdx.x * int64_t(kSumThreads);
+  const int64_t splat = first + threadIdx.x;
   float sum[VALUES] = {};
   if (splat < in.count) {
     in.for_each(splat, [&](const float* from) {
@@ -116,8 +110,8 @@ __global__ void __launch_bounds__(kSumThreads) sum_kernel(const __grid_constant_
 #pragma unroll
   for (int k = 0; k < VALUES; ++k) sums[threadIdx.x * kPitch + k] = sum[k];
   __syncthreads();
-  const std::int64_t left = in.count - first;
-  const int n_splats = left < kSumThreads ? static_cast<int>(left) : kSumThreads;
+  const int64_t left = in.count - first;
+  const int n_splats = left < kSumThreads ? int(left) : kSumThreads;
   for (int c = 0; c < out.count; ++c) {
     const int low = max(out.begin[c], value), high = min(out.begin[c + 1], value + n_values);
     const int part = high - low, width = out.begin[c + 1] - out.begin[c];
@@ -143,7 +137,7 @@ constexpr int kGradientPieces = kSplatGradient / 4, kGradientSplats = 128;
 __global__ void __launch_bounds__(kGradientPieces* kGradientSplats)
     sum_gradients_kernel(const __grid_constant__ SplatValues<float> in, float4* out) {
   const int piece = threadIdx.x % kGradientPieces;
-  const std::int64_t splat = blockIdx.x * std::int64_t{kGradientSplats} + threadIdx.x / kGradientPieces;
+  const int64_t splat = blockIdx.x * int64_t{kGradientSplats} + threadIdx.x / kGradientPieces;
   if (splat >= in.count) return;
   float4 sum{};
   in.for_each(splat, [&](const float* from) {
@@ -164,7 +158,7 @@ bool are_gradients(const SplatValues<float>& in, const SplatColumns<float>& out)
 void scatter(const ScatterSplats& splats, const SplatGroups& groups, const ScatterTargets& targets,
              SplatPlace* places, Workspace& workspace, CudaStream stream) {
   if (splats.count == 0) return;
-  auto* filled = workspace.allocate<std::int64_t>(groups.count);
+  auto* filled = workspace.allocate<int64_t>(groups.count);
   check(cudaMemsetAsync(filled, 0, groups.count * sizeof(*filled), stream), "scatter_splats");
   const auto kernel = groups.count <= kFewRanks ? scatter_kernel<kFewRanks> : scatter_kernel<kMaxRanks>;
   kernel<<<blocks_for(splats.count, kScatterBlock), kScatterBlock, 0, stream>>>(splats, groups, targets,
@@ -172,17 +166,16 @@ void scatter(const ScatterSplats& splats, const SplatGroups& groups, const Scatt
   check_launch("scatter_splats");
 }
 
-void gather(const std::int32_t* packed, const SplatGroups& groups, const SplatColumns<std::int32_t>& columns,
+void gather(const int32_t* packed, const SplatGroups& groups, const SplatColumns<int32_t>& columns,
             CudaStream stream) {
-  const std::int64_t most = *std::max_element(groups.size, groups.size + groups.count);
+  const int64_t most = *std::max_element(groups.size, groups.size + groups.count);
   if (most == 0) return;
   const dim3 grid(std::min(1024u, blocks_for(most, 256)), groups.count * columns.count);
   gather_kernel<<<grid, 256, 0, stream>>>(packed, groups, columns);
   check_launch("gather_splats");
 }
 
-template <>
-void sum<float>(const SplatValues<float>& in, const SplatColumns<float>& out, CudaStream stream) {
+template <> void sum<float>(const SplatValues<float>& in, const SplatColumns<float>& out, CudaStream stream) {
   if (in.count == 0 || in.width == 0) return;
   if (are_gradients(in, out)) {
     sum_gradients_kernel<<<blocks_for(in.count, kGradientSplats), kGradientPieces * kGradientSplats, 0,

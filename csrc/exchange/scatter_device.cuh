@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // The scatter of splats to the ranks that need them, packed for a collective (scatter_cuda.cu) or written to
-// the memory of peers (transport_cuda.cu). For each rank and column a warp writes one run of consecutive
-// words, in whole memory transactions except at its ends, so that a write across a link takes few packets.
-// Blocks agree on the positions of their runs with one atomic addition per block and rank.
+// the memory of peers (transport_cuda.cu). For each rank and column a warp writes one run of words, in whole
+// memory transactions except at its ends, so that a write across a link takes few packets. Blocks agree on
+// the positions of their runs with one atomic addition per block and rank.
 #pragma once
 #include "common/cuda.cuh"
 #include "exchange/scatter.h"
@@ -12,33 +12,28 @@ namespace blitzgs::cuda {
 inline constexpr int kScatterWarps = kScatterBlock / 32;
 static_assert(kPlaceSplats == 32, "a warp's splats are a run");
 
-// The state that all blocks share.
 struct ScatterState {
-  std::int64_t* filled;  // the number of positions of each group that blocks have taken; zero at the start
-  SplatPlace* places;    // the output of scatter
+  int64_t* filled;     // the number of positions of each group that blocks have taken; zero at the start
+  SplatPlace* places;  // the output of scatter
 
-  // Takes `count` positions of group m and returns the first.
-  __device__ std::int64_t take(int m, int count) const {
-    return count == 0 ? 0 : atomic_add(filled + m, count);
-  }
+  __device__ int64_t take(int m, int count) const { return count == 0 ? 0 : atomic_add(filled + m, count); }
 };
 
 // The number of words between the last multiple of 128 bytes and an address. A warp that starts so many words
 // before the address stores whole 128-byte transactions.
 __device__ __forceinline__ int words_past_line(const void* address) {
-  return static_cast<int>(reinterpret_cast<std::uintptr_t>(address) / 4 % 32);
+  return int(reinterpret_cast<std::uintptr_t>(address) / 4 % 32);
 }
 
 // A warp copies the `n` listed splats of one column to consecutive memory. Each lane has kAhead loads in
 // flight, because the values come from the second-level cache at best.
 template <int WIDTH>
-__device__ __forceinline__ void copy_run(const std::int32_t* from, const std::uint8_t* list, int n,
-                                         int any_width, std::int32_t* to) {
+__device__ __forceinline__ void copy_run(const int32_t* from, const uint8_t* list, int n, int any_width,
+                                         int32_t* to) {
   constexpr int kAhead = 4;
   const int width = WIDTH > 0 ? WIDTH : any_width, words = n * width;
-  for (int first = static_cast<int>(threadIdx.x % 32) - words_past_line(to); first < words;
-       first += 32 * kAhead) {
-    std::int32_t values[kAhead];
+  for (int first = int(threadIdx.x % 32) - words_past_line(to); first < words; first += 32 * kAhead) {
+    int32_t values[kAhead];
 #pragma unroll
     for (int k = 0; k < kAhead; ++k) {
       const int i = first + 32 * k, splat = i / width;
@@ -52,8 +47,8 @@ __device__ __forceinline__ void copy_run(const std::int32_t* from, const std::ui
   }
 }
 
-__device__ __forceinline__ void copy_run(const std::int32_t* from, const std::uint8_t* list, int n, int width,
-                                         std::int32_t* to) {
+__device__ __forceinline__ void copy_run(const int32_t* from, const uint8_t* list, int n, int width,
+                                         int32_t* to) {
   switch (width) {
     case 1:
       return copy_run<1>(from, list, n, width, to);

@@ -11,30 +11,27 @@
 // dependence on the order for the same reason: sums of integers are exact below 2^24, and larger means exceed
 // the largest float16, 65504, which is stored for them.
 #pragma once
-#include <cstdint>
-
 #include "common/kernel.h"
 
 namespace blitzgs::cpu {
 
 // costs [tiles] -> pieces [ceil(tiles / grain)], float16, rounded to nearest even, at most 65504.
-void store_tile_costs(const float* costs, std::int64_t tiles, std::int64_t grain, std::uint16_t* pieces);
+void store_tile_costs(const float* costs, int64_t tiles, int64_t grain, uint16_t* pieces);
 
 // The views of a batch, of `tiles` tiles each. A view without pieces (null) has the mean cost of the views
-// `similar`, added up in their order in floats; without any, zeros. `tile_cost` is added to the cost of each
-// tile.
+// `similar`, added up in their order in floats; without any, zeros. `tile_cost` is added to each.
 struct BatchCosts {
-  const std::uint16_t* const* views;
-  std::int64_t n_views;
-  const std::uint16_t* const* similar;
-  std::int64_t n_similar;
-  std::int64_t tiles, grain;
+  const uint16_t* const* views;
+  int64_t n_views;
+  const uint16_t* const* similar;
+  int64_t n_similar;
+  int64_t tiles, grain;
   float tile_cost;
 };
 
 // Cuts the tiles of the batch, one view after the other, into `parts` contiguous ranges of nearly equal cost.
 // bounds [parts + 1] ascend from 0 to n_views * tiles; each is the one nearest to its share of the total, the
 // later one of two.
-void divide_tiles(const BatchCosts& costs, std::int64_t parts, Workspace& workspace, std::int64_t* bounds);
+void divide_tiles(const BatchCosts& costs, int64_t parts, Workspace& workspace, int64_t* bounds);
 
 }  // namespace blitzgs::cpu

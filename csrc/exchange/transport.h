@@ -14,31 +14,28 @@
 // its writes are visible, before work that any rank queues after its barrier runs. Each rank also sends its
 // `values` to all others. control[m], int64: [M], the number of the last barrier that each rank reached; from
 // word `first` on [M, n], the values of each rank, then [n], their sums. host [M, n], in pinned memory,
-// receives the values for the host. A rank that waits for longer than timeout_seconds aborts its kernels, so
-// that its process gets an error.
+// receives the values for the host. A rank that waits for longer than timeout_seconds aborts with an error.
 #pragma once
-#include "common/kernel.h"
 #include "exchange/scatter.h"
 #include "project/project.h"
 
 namespace blitzgs {
 
-// The control words of all ranks, mapped into this process; `rank` is this rank.
 struct ControlWords {
-  std::int64_t* of[kMaxPeers];
+  int64_t* of[kMaxPeers];
   int count, rank;
 };
 
 // The columns of a splat that other ranks need, with their offsets in words: means2d, conics, opacities,
 // colors, depths, camera_ids and the Gaussian's persistent id.
-inline constexpr SplatColumns<const std::int32_t> kSentColumns{{}, {0, 2, 5, 6, 9, 10, 11, 13}, 7};
+inline constexpr SplatColumns<const int32_t> kSentColumns{{}, {0, 2, 5, 6, 9, 10, 11, 13}, 7};
 
 // The numbers of splats that this rank sends and receives, in device memory.
 struct SendPlan {
-  std::int64_t received;  // splats that this rank receives; first, so that ops can read it as a number
-  std::int64_t splats;    // splats of this rank
-  SplatGroups groups;     // the splats for each rank, and the position of the first of them in its buffer
-  std::int64_t filled[kMaxRanks];  // the number of positions for each rank that warps have taken
+  int64_t received;           // splats that this rank receives; first, so that ops can read it as a number
+  int64_t splats;             // splats of this rank
+  SplatGroups groups;         // the splats for each rank, and the position of the first of them in its buffer
+  int64_t filled[kMaxRanks];  // the number of positions for each rank that warps have taken
 };
 
 // everyone: project_totals of each rank, in device memory. targets: the addresses of the columns in each
@@ -47,23 +44,22 @@ struct SendArguments {
   ScatterSplats splats;  // the columns of kSentColumns; count is the capacity
   SendPlan* plan;
   SplatPlace* places;
-  const std::int64_t* everyone;
+  const int64_t* everyone;
   int n_views, n_ranks, rank;
   ScatterTargets targets;
 };
 
 namespace cuda {
 // host: null, or pinned memory.
-void device_barrier(const ControlWords&, std::int64_t number, const std::int64_t* values, int n_values,
-                    std::int64_t first, double timeout_seconds, std::int64_t* host, CudaStream);
+void device_barrier(const ControlWords&, int64_t number, const int64_t* values, int n_values, int64_t first,
+                    double timeout_seconds, int64_t* host, CudaStream);
 void send_splats(const SendArguments&, CudaStream);
 
 // The address at which kernels of the current device access pinned memory of the host. Throws if the memory
 // is not pinned. Kernels write numbers for the host there themselves: a cudaMemcpyAsync would be done by
-// another engine of the GPU, and the stream would wait before and after it. The host may read them after it
-// has waited for the kernel.
-std::int64_t* device_address(std::int64_t* pinned);
-void copy_to_host(const std::int64_t* values, std::int64_t n, std::int64_t* host, CudaStream);
+// another engine of the GPU, and the stream would wait before and after it. The host waits, then reads.
+int64_t* device_address(int64_t* pinned);
+void copy_to_host(const int64_t* values, int64_t n, int64_t* host, CudaStream);
 }  // namespace cuda
 
 }  // namespace blitzgs

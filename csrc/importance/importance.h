@@ -9,25 +9,20 @@
 //   over the tiles [tile_begin, tile_end). Splats in no list get zeros.
 //
 // The sums are exact: alpha T of a pixel has the bits with which the backend renders the pixel (with the same
-// tile size), and the sums are integers, so tile ranges, ranks, threads, atomics and repetition change no
-// bit. An alpha T is at least 1e-4 / 255, so it is never rounded to zero, and below 1, so a sum over 2^31
-// pixels fits. CPU and CUDA agree to the rounding of alpha. The cost is O(entries processed x pixels of the
-// splat).
+// tile size), and the sums are integers, so tile ranges, ranks, threads and atomics change no bit. An alpha T
+// is at least 1e-4 / 255, so never rounded to zero, and below 1, so a sum over 2^31 pixels fits. CPU and CUDA
+// agree to the rounding of alpha. The cost is O(entries processed x pixels of the splat).
 #pragma once
-#include <cmath>
-#include <cstdint>
-
-#include "common/kernel.h"
 #include "rasterize/rasterize.h"
 
 namespace blitzgs {
 
-inline constexpr std::int64_t kContributionScale = std::int64_t{1} << 32;  // the number of units in 1
+inline constexpr int64_t kContributionScale = int64_t{1} << 32;  // the number of units in 1
 
 struct ContributionSums {
-  std::int64_t* weights;
-  std::int32_t* pixels;
-  std::int64_t* squares;  // null: not wanted
+  int64_t* weights;
+  int32_t* pixels;
+  int64_t* squares;  // null: not wanted
 };
 
 namespace BLITZGS_BACKEND {
@@ -57,11 +52,11 @@ enum class ScoreRule : int { kWeight = 0, kRoot = 1, kDensity = 2 };
 // Clears the bits of one word of a Gaussian's row of the cull matrix after the other. It stores a word only
 // when the next bit is in another one, because stores would keep the loads of later splats waiting.
 struct CullRow {
-  std::uint32_t* words;
-  std::int32_t word = 0;
-  std::uint32_t bits = 0;
+  uint32_t* words;
+  int32_t word = 0;
+  uint32_t bits = 0;
 
-  BLITZGS_HD void clear(std::int32_t column) {
+  BLITZGS_HD void clear(int32_t column) {
     if (column / 32 != word) store();
     word = column / 32;
     bits |= 1u << column % 32;
@@ -73,28 +68,24 @@ struct CullRow {
 };
 
 struct ViewSums {
-  const std::int64_t* weights;
-  const std::int32_t* pixels;
-  const std::int32_t* radii;
-  const std::int32_t* camera_ids;
+  const int64_t* weights;
+  const int32_t *pixels, *radii, *camera_ids;
   const bool* counts;
-  const std::int32_t* visible_ids;
-  const std::int32_t* splat_offsets;
-  std::int64_t n, words;
-  std::int64_t* score;
-  std::int32_t* seen;
-  std::int32_t* counted;
-  std::uint32_t* cull;
+  const int32_t *visible_ids, *splat_offsets;
+  int64_t n, words;
+  int64_t* score;
+  int32_t *seen, *counted;
+  uint32_t* cull;
   ScoreRule rule;
   double eps, unit;
-  std::int32_t columns[kMaxViews];
+  int32_t columns[kMaxViews];
 
-  BLITZGS_HD void operator()(std::int64_t u) const {
-    const std::int32_t id = visible_ids[u];
-    std::int64_t sum = 0;
-    std::int32_t views = 0, views_counted = 0;
+  BLITZGS_HD void operator()(int64_t u) const {
+    const int32_t id = visible_ids[u];
+    int64_t sum = 0;
+    int32_t views = 0, views_counted = 0;
     CullRow row{cull + id * words};
-    for (std::int64_t i = splat_offsets[u]; i < splat_offsets[u + 1]; ++i) {
+    for (int64_t i = splat_offsets[u]; i < splat_offsets[u + 1]; ++i) {
       sum += score_term(i);
       views += radii[2 * i] > 0 || radii[2 * i + 1] > 0;
       if (!counts[i]) continue;
@@ -109,15 +100,15 @@ struct ViewSums {
 
  private:
   // The summand of a splat, in units of the score, rounded to the nearest integer, ties to even.
-  BLITZGS_HD std::int64_t score_term(std::int64_t splat) const {
-    double term = static_cast<double>(weights[splat]) / 4294967296.0;
-    const double area = static_cast<double>(pixels[splat]) + eps;
+  BLITZGS_HD int64_t score_term(int64_t splat) const {
+    double term = double(weights[splat]) / 4294967296.0;
+    const double area = double(pixels[splat]) + eps;
     if (rule == ScoreRule::kDensity) term = term / area;
     if (rule == ScoreRule::kRoot) term = term / std::sqrt(area);
 #ifdef __CUDA_ARCH__
     return __double2ll_rn(term / unit);
 #else
-    return static_cast<std::int64_t>(std::nearbyint(term / unit));
+    return int64_t(std::nearbyint(term / unit));
 #endif
   }
 };

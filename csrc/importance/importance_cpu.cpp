@@ -1,5 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
 #include <numeric>
 
 #include "importance/importance.h"
@@ -19,41 +18,39 @@ void contributions(const RasterizeInput<T>& in, const ContributionSums& sums, Wo
   });
 }
 
-template void contributions(const RasterizeInput<float>&, const ContributionSums&, Workspace&, CudaStream);
-template void contributions(const RasterizeInput<double>&, const ContributionSums&, Workspace&, CudaStream);
+BLITZGS_FOR_BOTH_DTYPES(contributions);
 
 namespace {
 
 void scan(const MassCutArgs& args, int round) {
-  const auto add = [&](std::int64_t item) {
+  const auto add = [&](int64_t item) {
     const ScanTerm term = scan_term(args, round, item);
     if (term.adds) args.sums[args.segments[item] * kDigits + term.digit] += term.amount;
   };
   if (round > 1) {
-    for (std::int32_t i = 1; i <= args.listed[0]; ++i) add(args.listed[i]);
+    for (int32_t i = 1; i <= args.listed[0]; ++i) add(args.listed[i]);
     return;
   }
   args.listed[0] = 0;
-  for (std::int64_t item = 0; item < args.n_items; ++item) {
+  for (int64_t item = 0; item < args.n_items; ++item) {
     add(item);
-    if (round == 1 && is_listed(args, item)) args.listed[++args.listed[0]] = static_cast<std::int32_t>(item);
+    if (round == 1 && is_listed(args, item)) args.listed[++args.listed[0]] = int32_t(item);
   }
 }
 
 void descend(const MassCutArgs& args, int round) {
   const bool for_ids = round >= kRounds, first = round % kRounds == 0;
-  for (std::int64_t s = 0; s < args.n_segments; ++s) {
+  for (int64_t s = 0; s < args.n_segments; ++s) {
     SegmentSearch& both = args.searches[s];
     MassSearch& search = for_ids ? both.id : both.weight;
-    std::int64_t* const sums = args.sums + s * kDigits;
+    int64_t* const sums = args.sums + s * kDigits;
     if (round == 0) {
-      search = {
-          kAboveAllWeights, 0,
-          share_of(std::accumulate(sums, sums + kDigits, std::int64_t{0}), args.numerator, args.denominator),
-          0};
+      search = {kAboveAllWeights, 0,
+                share_of(std::accumulate(sums, sums + kDigits, int64_t{0}), args.numerator, args.denominator),
+                0};
     }
     if (descends(search, first)) {
-      std::int64_t above = 0;
+      int64_t above = 0;
       int digit = kDigits - 1;
       while (above + sums[digit] < search.missing) above += sums[digit--];
       take_digit(search, first, digit, above, sums[digit]);
@@ -74,7 +71,7 @@ void mass_cut(const MassCutArgs& args, int first_step, int last_step, CudaStream
     }
   }
   if (last_step != kSteps) return;
-  for (std::int64_t item = 0; item < args.n_items; ++item) args.chosen[item] = is_chosen(args, item);
+  for (int64_t item = 0; item < args.n_items; ++item) args.chosen[item] = is_chosen(args, item);
 }
 
 }  // namespace blitzgs::cpu

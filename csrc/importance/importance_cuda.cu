@@ -1,18 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "importance/importance.h"
 
-#include <type_traits>
-
-#include "common/cuda.cuh"
 #include "common/rows.h"
 #include "rasterize/forward.cuh"
 
 namespace blitzgs::cuda {
-
 namespace {
 
-// A half-warp writes the weights of this many entries at its 16 pixels to shared memory; then each lane sums
-// over the pixels for one entry.
+// A half-warp writes the weights of this many entries at its pixels; then each lane sums those of one entry.
 constexpr int kGroup = 16;
 constexpr int kEntryStride =
     kHalfWarp + 4;  // words: lanes read quads of neighbouring entries without conflict
@@ -25,17 +20,17 @@ constexpr int kGroupWords = kGroup * kEntryStride + 16;
 // number of pixels in its high bits.
 struct __align__(8) TileSum {
   static constexpr int kLowBits = 22, kPixelShift = 20;
-  std::uint32_t low, high;
+  uint32_t low, high;
 
-  __device__ __forceinline__ void add(std::uint64_t sum, std::uint32_t pixels) {
-    atomicAdd(&low, static_cast<std::uint32_t>(sum) & ((1u << kLowBits) - 1));
-    atomicAdd(&high, static_cast<std::uint32_t>(sum >> kLowBits) | pixels << kPixelShift);
+  __device__ __forceinline__ void add(uint64_t sum, uint32_t pixels) {
+    atomicAdd(&low, uint32_t(sum) & ((1u << kLowBits) - 1));
+    atomicAdd(&high, uint32_t(sum >> kLowBits) | pixels << kPixelShift);
   }
-  __device__ __forceinline__ std::int64_t sum() const {
-    const std::int64_t rest = high & ((1u << kPixelShift) - 1);
+  __device__ __forceinline__ int64_t sum() const {
+    const int64_t rest = high & ((1u << kPixelShift) - 1);
     return (rest << kLowBits) + low;
   }
-  __device__ __forceinline__ std::uint32_t pixels() const { return high >> kPixelShift; }
+  __device__ __forceinline__ uint32_t pixels() const { return high >> kPixelShift; }
 };
 
 // Finds the sums of an entry over a tile, which take the place of its colour: the TileSum of its weights and,
@@ -43,55 +38,52 @@ struct __align__(8) TileSum {
 __device__ __forceinline__ TileSum* sums_of(Entry& entry) { return reinterpret_cast<TileSum*>(entry.color); }
 
 // Replaces copy_color(): an entry gets no colour. Its sums begin at zero.
+template <bool kSquares> struct NoColors {};
 template <bool kSquares>
-struct NoColors {};
-template <bool kSquares>
-__device__ __forceinline__ void copy_color(float* shared, NoColors<kSquares>, std::int32_t) {
+__device__ __forceinline__ void copy_color(float* shared, NoColors<kSquares>, int32_t) {
   using Sums = std::conditional_t<kSquares, uint4, uint2>;
   *reinterpret_cast<Sums*>(shared) = Sums{};
 }
 
-// Adds the sums of an entry over a tile to those of its splat.
 template <bool kSquares>
-__device__ __forceinline__ void send_sums(Entry& entry, std::int32_t splat, const ContributionSums& sums) {
+__device__ __forceinline__ void send_sums(Entry& entry, int32_t splat, const ContributionSums& sums) {
   const TileSum weights = sums_of(entry)[0];
   if (weights.pixels() == 0) return;  // no pixel composited the entry
   atomic_add(sums.weights + splat, weights.sum());
-  atomicAdd(sums.pixels + splat, static_cast<std::int32_t>(weights.pixels()));
+  atomicAdd(sums.pixels + splat, int32_t(weights.pixels()));
   if constexpr (kSquares) atomic_add(sums.squares + splat, sums_of(entry)[1].sum());
 }
 
 struct ContributionShared {
   EntryBatch<kForwardBatch> batch;
-  __align__(16) std::uint32_t groups[Tile::kSubtiles][kGroupWords];
+  __align__(16) uint32_t groups[Tile::kSubtiles][kGroupWords];
 };
 
 struct ContributionArguments {
   const PackedSplat* splats;
-  const std::int32_t* isect_splats;
-  const std::int64_t* tile_offsets;
+  const int32_t* isect_splats;
+  const int64_t* tile_offsets;
   TileGrid grid;
   TileOrder order;
   ContributionSums sums;
 };
 
 // Returns 1, or 0 for 0. The compiler turns min(units, 1) into a comparison, an addition and a move.
-__device__ __forceinline__ std::uint32_t one_if_any(std::uint32_t units) {
-  std::uint32_t one;
+__device__ __forceinline__ uint32_t one_if_any(uint32_t units) {
+  uint32_t one;
   asm("min.u32 %0, %1, 1;" : "=r"(one) : "r"(units));
   return one;
 }
 
 // Sums an entry's weights, and with kSquares their squares, over the 16 pixels of a subtile, and adds the
 // sums to those of the entry.
-template <bool kSquares>
-__device__ __forceinline__ void sum_pixels(const std::uint32_t* words, Entry& entry) {
-  std::uint64_t weight = 0, squares = 0;
-  std::uint32_t pixels = 0;
+template <bool kSquares> __device__ __forceinline__ void sum_pixels(const uint32_t* words, Entry& entry) {
+  uint64_t weight = 0, squares = 0;
+  uint32_t pixels = 0;
 #pragma unroll
   for (int i = 0; i < kHalfWarp / 4; ++i) {
     const uint4 four = reinterpret_cast<const uint4*>(words)[i];
-    for (const std::uint32_t units : {four.x, four.y, four.z, four.w}) {
+    for (const uint32_t units : {four.x, four.y, four.z, four.w}) {
       weight += units;
       if constexpr (kSquares) squares += __umulhi(units, units);
       pixels += one_if_any(units);
@@ -113,21 +105,20 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) contributions_kernel(const 
   auto& batch = shared.batch;
   const int thread = threadIdx.x, lane = thread % kHalfWarp;
   wait_for_earlier_kernels();
-  const TilePlace tile = locate_tile(args.grid, args.order.tile(static_cast<int>(blockIdx.x)));
+  const TilePlace tile = locate_tile(args.grid, args.order.tile(int(blockIdx.x)));
   const Pixel pixel = locate_pixel(args.grid, tile, thread);
-  const std::int64_t start = args.tile_offsets[tile.tile];
-  const int count = static_cast<int>(args.tile_offsets[tile.tile + 1] - start);
+  const int64_t start = args.tile_offsets[tile.tile];
+  const int count = int(args.tile_offsets[tile.tile + 1] - start);
   batch.init(thread);
 
   Compositor<kContributionScale> state;
   state.limit = pixel.inside ? kLog2Cut : INFINITY;
-  std::uint32_t* const group = shared.groups[pixel.subtile];
+  uint32_t* const group = shared.groups[pixel.subtile];
   const auto splat_at = [&](int at) {
     return thread < kBatch && at < count ? args.isect_splats[start + at] : -1;
   };
-  // `summed` is the splat of this thread's entry in the previous batch. Its sums are complete after the
-  // barrier.
-  std::int32_t splat = splat_at(thread), next_splat = splat_at(thread + kBatch), summed = -1;
+  // `summed` is the splat of this thread's entry in the previous batch. The barrier completes its sums.
+  int32_t splat = splat_at(thread), next_splat = splat_at(thread + kBatch), summed = -1;
   int buffer = 0;
   const auto send_summed = [&] {
     if (summed >= 0) send_sums<kSquares>(batch.entries[buffer ^ 1][thread], summed, args.sums);
@@ -159,7 +150,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 4) contributions_kernel(const 
       }
       __syncwarp();
       if (lane < 4 * filled) {
-        const std::uint32_t offset = batch.lists[pixel.subtile][4 * i + lane];
+        const uint32_t offset = batch.lists[pixel.subtile][4 * i + lane];
         sum_pixels<kSquares>(group + lane * kEntryStride, *reinterpret_cast<Entry*>(entries + offset));
       }
       __syncwarp();
@@ -180,15 +171,14 @@ void contributions<float>(const RasterizeInput<float>& in, const ContributionSum
   if (sums.squares) {
     check(cudaMemsetAsync(sums.squares, 0, in.n_splats * sizeof(*sums.squares), stream), "contributions");
   }
-  const std::int64_t owned = in.grid.tile_end - in.grid.tile_begin;
+  const int64_t owned = in.grid.tile_end - in.grid.tile_begin;
   if (owned == 0 || in.n_splats == 0) return;
   auto* packed = static_cast<PackedSplat*>(workspace.allocate_bytes(in.n_splats * sizeof(PackedSplat)));
-  const TileOrder order(in.grid, owned, workspace.allocate<std::int32_t>(TileOrder::words(in.grid, owned)));
+  const TileOrder order(in.grid, owned, workspace.allocate<int32_t>(TileOrder::words(in.grid, owned)));
   prepare("contributions", in, packed, nullptr, order, stream);
   const ContributionArguments args{packed, in.isect_splats, in.tile_offsets, in.grid, order, sums};
   launch_early("contributions", sums.squares ? contributions_kernel<true> : contributions_kernel<false>,
-               {static_cast<unsigned>(order.n_tiles), Tile::kThreads, stream, sizeof(ContributionShared)},
-               args);
+               {unsigned(order.n_tiles), Tile::kThreads, stream, sizeof(ContributionShared)}, args);
 }
 
 template void for_each_row(const ViewSums&, CudaStream);

@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The mass cut: for each segment, the smallest set of items by descending weight (ties by ascending id) whose
-// weights sum to at least a share of the segment's total. One search serves all segments, without sorting and
-// without waiting on the host. The importance pass cuts each view's contributions at 99 % in this way
-// (BlitzGS, section 3.2).
+// weights sum to at least a share of the segment's total. One search serves all segments, without sorting or
+// waiting on the host. The importance pass cuts the weights of a view at 99 % (BlitzGS, section 3.2).
 //
 //   weights [P] int64 in [0, 2^62), segments [P] int32, owners [P] int32 and ids [N] int64: item i has the id
 //   ids[owners[i]], unique within its segment  ->  chosen [P]
@@ -13,18 +12,14 @@
 //
 //   scan:    sums the weights of the items whose earlier digits equal those of the threshold, by their next
 //            digit;
-//   descent: finds the next digit of the threshold: the digit, from the largest one down, at which the sums
-//            reach the missing weight.
+//   descent: finds the digit, from the largest one down, at which the sums reach the missing weight.
 //
 // Sums are integers; between scan and descent they may be added up over ranks. If more items than needed
 // weigh as much as the threshold, kRounds more rounds find the largest id in the set, by the same search for
 // 2^63 - 1 - id in which each item counts one. Few items agree with the threshold in the first digit: the
-// second scan lists them, and later scans read the list.
-//
-// The result is exact: no order of additions, division among ranks or repetition changes a bit. The cost is
-// O(P).
+// second scan lists them, and later scans read the list. The result is exact, whatever the order of additions
+// or the division among ranks. The cost is O(P).
 #pragma once
-#include <cstdint>
 #include <limits>
 
 #include "common/kernel.h"
@@ -43,31 +38,30 @@ inline constexpr int kChoiceStep = 4 * kRounds, kSteps = kChoiceStep + 1;
 
 // The state of the search in a segment. It is done when shift is 0.
 struct MassSearch {
-  std::int64_t head, shift;  // the bits of the threshold from bit `shift` on
-  std::int64_t missing;      // the weight that items with these bits have to contribute to the set
-  std::int64_t held;         // the weight of all items with these bits
+  int64_t head, shift;  // the bits of the threshold from bit `shift` on
+  int64_t missing;      // the weight that items with these bits have to contribute to the set
+  int64_t held;         // the weight of all items with these bits
 };
 // The initial head: no item weighs as much, so an empty search chooses no item.
-inline constexpr std::int64_t kAboveAllWeights = std::numeric_limits<std::int64_t>::max();
+inline constexpr int64_t kAboveAllWeights = std::numeric_limits<int64_t>::max();
 
 struct SegmentSearch {
   MassSearch weight, id;
 };
 
 struct MassCutArgs {
-  const std::int64_t* weights;
-  const std::int32_t* segments;
-  const std::int32_t* owners;
-  const std::int64_t* ids;
-  std::int64_t n_items, n_segments;
-  std::int64_t numerator, denominator;  // the share
-  SegmentSearch* searches;              // [S]
-  std::int64_t* sums;                   // [S, kDigits], zero between a descent and the next scan
-  std::int32_t* listed;                 // [1 + P]: the number of listed items, then these items
-  bool* chosen;                         // [P], written by the last step
+  const int64_t* weights;
+  const int32_t *segments, *owners;
+  const int64_t* ids;
+  int64_t n_items, n_segments;
+  int64_t numerator, denominator;  // the share
+  SegmentSearch* searches;         // [S]
+  int64_t* sums;                   // [S, kDigits], zero between a descent and the next scan
+  int32_t* listed;                 // [1 + P]: the number of listed items, then these items
+  bool* chosen;                    // [P], written by the last step
 };
 
-BLITZGS_HD int bits_of(std::int64_t number) {
+BLITZGS_HD int bits_of(int64_t number) {
 #if defined(__CUDA_ARCH__)
   return 64 - __clzll(number);
 #else
@@ -76,22 +70,20 @@ BLITZGS_HD int bits_of(std::int64_t number) {
 }
 
 // The first digit of a number in [0, 2^63). It is 0 for 0 and never decreases with the number.
-BLITZGS_HD int first_digit(std::int64_t number) {
+BLITZGS_HD int first_digit(int64_t number) {
   if (number == 0) return 0;
   const int exponent = bits_of(number) - 1, behind = exponent - kFirstMantissaBits;
-  const std::int64_t head = behind >= 0 ? number >> behind : number << -behind;
-  return 1 + (exponent << kFirstMantissaBits) + static_cast<int>(head & ((1 << kFirstMantissaBits) - 1));
+  const int64_t head = behind >= 0 ? number >> behind : number << -behind;
+  return 1 + (exponent << kFirstMantissaBits) + int(head & ((1 << kFirstMantissaBits) - 1));
 }
 
-BLITZGS_HD int later_digit_bits(std::int64_t shift) {
-  return shift < kDigitBits ? static_cast<int>(shift) : kDigitBits;
-}
+BLITZGS_HD int later_digit_bits(int64_t shift) { return shift < kDigitBits ? int(shift) : kDigitBits; }
 
 // Appends the digit that a descent found. above: the sum of the larger digits; held: the sum of this digit.
-BLITZGS_HD void take_digit(MassSearch& search, bool first, int digit, std::int64_t above, std::int64_t held) {
+BLITZGS_HD void take_digit(MassSearch& search, bool first, int digit, int64_t above, int64_t held) {
   if (first) {
     const int exponent = (digit - 1) >> kFirstMantissaBits, behind = exponent - kFirstMantissaBits;
-    const std::int64_t head = ((digit - 1) & ((1 << kFirstMantissaBits) - 1)) | 1 << kFirstMantissaBits;
+    const int64_t head = ((digit - 1) & ((1 << kFirstMantissaBits) - 1)) | 1 << kFirstMantissaBits;
     search.head = digit == 0 ? 0 : behind >= 0 ? head : head >> -behind;
     search.shift = digit > 0 && behind > 0 ? behind : 0;
   } else {
@@ -104,8 +96,8 @@ BLITZGS_HD void take_digit(MassSearch& search, bool first, int digit, std::int64
 }
 
 // ceil(share * total), without computing the product, which might overflow.
-BLITZGS_HD std::int64_t share_of(std::int64_t total, std::int64_t numerator, std::int64_t denominator) {
-  const std::int64_t rest = denominator - numerator;
+BLITZGS_HD int64_t share_of(int64_t total, int64_t numerator, int64_t denominator) {
+  const int64_t rest = denominator - numerator;
   return total - total / denominator * rest - total % denominator * rest / denominator;
 }
 
@@ -113,12 +105,12 @@ BLITZGS_HD std::int64_t share_of(std::int64_t total, std::int64_t numerator, std
 // the items that weigh as much as the threshold are not in the set; otherwise `missing` is 0.
 BLITZGS_HD MassSearch search_of_ids(const MassSearch& weight) {
   if (weight.head == kAboveAllWeights) return {0, 0, 0, 0};
-  const std::int64_t wanted = (weight.missing + weight.head - 1) / weight.head;
+  const int64_t wanted = (weight.missing + weight.head - 1) / weight.head;
   return {0, 0, weight.held / weight.head > wanted ? wanted : 0, 0};
 }
 
-BLITZGS_HD std::int64_t id_key_of(const MassCutArgs& args, std::int64_t item) {
-  return std::numeric_limits<std::int64_t>::max() - args.ids[args.owners[item]];
+BLITZGS_HD int64_t id_key_of(const MassCutArgs& args, int64_t item) {
+  return std::numeric_limits<int64_t>::max() - args.ids[args.owners[item]];
 }
 
 // The summand of an item in a scan: `amount`, to the sum of `digit`. adds: whether the item's earlier digits
@@ -126,50 +118,46 @@ BLITZGS_HD std::int64_t id_key_of(const MassCutArgs& args, std::int64_t item) {
 struct ScanTerm {
   bool adds;
   int digit;
-  std::int64_t amount;
+  int64_t amount;
 };
 
-BLITZGS_HD ScanTerm digit_under(const MassSearch& search, std::int64_t number, bool first,
-                                std::int64_t amount) {
+BLITZGS_HD ScanTerm digit_under(const MassSearch& search, int64_t number, bool first, int64_t amount) {
   if (first) return {true, first_digit(number), amount};
   if (search.shift == 0 || number >> search.shift != search.head) return {false, 0, 0};
   const int bits = later_digit_bits(search.shift);
-  const std::int64_t digit = number >> (search.shift - bits) & ((std::int64_t{1} << bits) - 1);
-  return {true, static_cast<int>(digit), amount};
+  const int64_t digit = number >> (search.shift - bits) & ((int64_t{1} << bits) - 1);
+  return {true, int(digit), amount};
 }
 
-BLITZGS_HD ScanTerm scan_term(const MassCutArgs& args, int round, std::int64_t item) {
+BLITZGS_HD ScanTerm scan_term(const MassCutArgs& args, int round, int64_t item) {
   const SegmentSearch& search = args.searches[args.segments[item]];
-  const std::int64_t weight = args.weights[item];
+  const int64_t weight = args.weights[item];
   if (round < kRounds) return digit_under(search.weight, weight, round == 0, weight);
   if (search.id.missing == 0 || weight != search.weight.head) return {false, 0, 0};
   return digit_under(search.id, id_key_of(args, item), round == kRounds, 1);
 }
 
-BLITZGS_HD bool is_listed(const MassCutArgs& args, std::int64_t item) {
+BLITZGS_HD bool is_listed(const MassCutArgs& args, int64_t item) {
   const MassSearch& search = args.searches[args.segments[item]].weight;
   return args.weights[item] >> search.shift == search.head;
 }
 
-BLITZGS_HD bool is_chosen(const MassCutArgs& args, std::int64_t item) {
+BLITZGS_HD bool is_chosen(const MassCutArgs& args, int64_t item) {
   const SegmentSearch& search = args.searches[args.segments[item]];
-  const std::int64_t weight = args.weights[item];
+  const int64_t weight = args.weights[item];
   if (weight != search.weight.head) return weight > search.weight.head;
   return search.id.missing == 0 || id_key_of(args, item) >= search.id.head;
 }
 
-// Whether a descent has another digit to find.
 BLITZGS_HD bool descends(const MassSearch& search, bool first) {
   return first ? search.missing > 0 : search.shift > 0;
 }
 
-// Whether a round after the first one has a digit to find.
 BLITZGS_HD bool finds_digit(const SegmentSearch& search, int round) {
   return round < kRounds ? descends(search.weight, false) : descends(search.id, round == kRounds);
 }
 
 namespace BLITZGS_BACKEND {
-// Runs the steps first_step to last_step - 1.
 void mass_cut(const MassCutArgs& args, int first_step, int last_step, CudaStream);
 }  // namespace BLITZGS_BACKEND
 

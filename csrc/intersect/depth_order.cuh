@@ -6,9 +6,6 @@
 // between the nearest and the farthest depth), the key lacks the low bits, and splats with equal keys are
 // compared by depth and then by id.
 #pragma once
-#include <cstdint>
-
-#include "common/cuda.cuh"
 #include "intersect/intersect.h"
 #include "intersect/radix_sweep.cuh"
 
@@ -18,8 +15,7 @@
 
 namespace blitzgs::cuda {
 
-// The owned tiles of one tile row that a splat touches. Tile numbers count from tile_begin and fit 32 bits
-// (intersect_op.cpp).
+// The owned tiles of one tile row that a splat touches. Tile numbers count from tile_begin, in 32 bits.
 struct Owned {
   int first, last;  // tiles [first, last)
   int ty;           // the tile row in its image
@@ -30,7 +26,7 @@ struct SplatShape {
   int camera;
 };
 
-__device__ __forceinline__ SplatShape load_splat(const IntersectInput<float>& in, std::int64_t index) {
+__device__ __forceinline__ SplatShape load_splat(const IntersectInput<float>& in, int64_t index) {
   const float2 mean = reinterpret_cast<const float2*>(in.means2d)[index];
   const float* const conic = in.conics + 3 * index;
   const SplatShape s{
@@ -44,9 +40,9 @@ __device__ __forceinline__ SplatShape load_splat(const IntersectInput<float>& in
 
 // The owned tiles [begin, end) of tile row ty of a camera's image. Nothing is owned if first >= last.
 __device__ __forceinline__ Owned clip_to_owned(const TileGrid& grid, int camera, int ty, int begin, int end) {
-  const int image = camera * static_cast<int>(grid.per_image()) - static_cast<int>(grid.tile_begin);
+  const int image = camera * int(grid.per_image()) - int(grid.tile_begin);
   const int base = image + ty * grid.tiles_x;
-  return {max(base + begin, 0), min(base + end, static_cast<int>(grid.tile_end - grid.tile_begin)), ty};
+  return {max(base + begin, 0), min(base + end, int(grid.tile_end - grid.tile_begin)), ty};
 }
 
 // The owned tiles that a splat touches: the first tile (counted from tile_begin) and a byte for each of up to
@@ -55,32 +51,32 @@ __device__ __forceinline__ Owned clip_to_owned(const TileGrid& grid, int camera,
 // form is called large. It has first = kLarge; rows[0] is its number of tiles, rows[1] and rows[2] are the
 // position of its first list entry once that is known.
 struct alignas(16) Touched {
-  static constexpr std::uint32_t kLarge = ~0u;
+  static constexpr uint32_t kLarge = ~0u;
   static constexpr int kWords = 3;
-  std::uint32_t first, rows[kWords];
+  uint32_t first, rows[kWords];
 
-  static constexpr std::uint32_t kCounts = 0x0f0f0f0fu, kOnes = 0x01010101u, kHighBits = 0x80808080u;
+  static constexpr uint32_t kCounts = 0x0f0f0f0fu, kOnes = 0x01010101u, kHighBits = 0x80808080u;
 
   __device__ bool large() const { return first == kLarge; }
 
   // The position of a large splat's first list entry.
-  __device__ std::int64_t begin() const { return static_cast<std::int64_t>(rows[2]) << 32 | rows[1]; }
-  __device__ void set_begin(std::int64_t position) {
-    rows[1] = static_cast<std::uint32_t>(position);
-    rows[2] = static_cast<std::uint32_t>(position >> 32);
+  __device__ int64_t begin() const { return int64_t(rows[2]) << 32 | rows[1]; }
+  __device__ void set_begin(int64_t position) {
+    rows[1] = uint32_t(position);
+    rows[2] = uint32_t(position >> 32);
   }
 
-  __device__ std::int32_t count() const {
-    if (large()) return static_cast<std::int32_t>(rows[0]);
-    const std::uint32_t sums = (rows[0] & kCounts) + (rows[1] & kCounts) + (rows[2] & kCounts);
-    return static_cast<std::int32_t>(sums * kOnes >> 24);
+  __device__ int32_t count() const {
+    if (large()) return int32_t(rows[0]);
+    const uint32_t sums = (rows[0] & kCounts) + (rows[1] & kCounts) + (rows[2] & kCounts);
+    return int32_t(sums * kOnes >> 24);
   }
 
   // Returns tile k < count() of a splat that is not large, counted from tile_begin.
-  __device__ std::uint32_t tile(std::uint32_t k, std::uint32_t tiles_x) const {
-    std::uint32_t start = first, word = rows[0];
+  __device__ uint32_t tile(uint32_t k, uint32_t tiles_x) const {
+    uint32_t start = first, word = rows[0];
     // Byte j of `through` is the number of tiles in rows 0 to j of the word.
-    std::uint32_t through = (word & kCounts) * kOnes;
+    uint32_t through = (word & kCounts) * kOnes;
 #pragma unroll
     for (int i = 1; i < kWords; ++i) {
       if (k < through >> 24) break;
@@ -89,9 +85,8 @@ struct alignas(16) Touched {
       word = rows[i];
       through = (word & kCounts) * kOnes;
     }
-    // Finds the first byte of `through` that is larger than k. Bytes are at most 60, so the subtraction does
-    // not borrow between them.
-    const std::uint32_t reached = ((through | kHighBits) - (k + 1) * kOnes) & kHighBits;
+    // Finds the first byte of `through` that is larger than k. Bytes are at most 60, so none borrows.
+    const uint32_t reached = ((through | kHighBits) - (k + 1) * kOnes) & kHighBits;
     const int bit = (__ffs(reached) - 1) & 24;
     return start + (bit >> 3) * tiles_x + (word >> (bit + 4) & 15u) - 8 + k - (through << 8 >> bit & 255u);
   }
@@ -104,7 +99,6 @@ struct alignas(16) Touched {
   }
 };
 
-// Finds the owned tiles that a splat touches.
 __device__ __forceinline__ Touched find_touched(const TileGrid& grid, const SplatShape& splat) {
   int count = 0, first = 0, top = 0;
   bool fits = true;
@@ -117,18 +111,18 @@ __device__ __forceinline__ Touched find_touched(const TileGrid& grid, const Spla
       top = owned.ty;
     }
     const int n = owned.last - owned.first, down = owned.ty - top;
-    const unsigned shift = static_cast<unsigned>(owned.first - first - down * grid.tiles_x + 8);
+    const unsigned shift = unsigned(owned.first - first - down * grid.tiles_x + 8);
     fits &= down < 4 * Touched::kWords && n < 16 && shift < 16;
-    const std::uint32_t bits = (shift << 4 | n) << 8 * (down & 3);
+    const uint32_t bits = (shift << 4 | n) << 8 * (down & 3);
 #pragma unroll
     for (int i = 0; i < Touched::kWords; ++i) touched.rows[i] |= down >> 2 == i ? bits : 0u;
     count += n;
   };
   for_each_tile_row(splat.mean, splat.conic, splat.opacity, grid.width, grid.height, grid.tile_size, add);
-  touched.first = static_cast<std::uint32_t>(first);
+  touched.first = uint32_t(first);
   if (!fits) {
     touched.first = Touched::kLarge;
-    touched.rows[0] = static_cast<std::uint32_t>(count);
+    touched.rows[0] = uint32_t(count);
   }
   return touched;
 }
@@ -139,13 +133,11 @@ inline constexpr int kRangeBlocks = kDepthThreads, kRangeThreads = 512;
 inline constexpr int kTieItems = 4, kTieSplats = kDepthThreads * kTieItems;
 inline constexpr int kShortRun = 16;  // the longest run of equal keys that one thread orders
 
-// The smallest and the largest of some depths, as ordered_bits().
 struct DepthRange {
-  std::uint32_t low, high;
+  uint32_t low, high;
 
   // Returns the union of the ranges of all threads of a block to each thread. All threads call this.
-  template <int kThreads>
-  __device__ DepthRange over_block() const {
+  template <int kThreads> __device__ DepthRange over_block() const {
     __shared__ DepthRange warps[kThreads / 32];
     const int lane = threadIdx.x % 32;
     DepthRange range{__reduce_min_sync(kFullWarp, low), __reduce_max_sync(kFullWarp, high)};
@@ -161,7 +153,7 @@ struct DepthDigits {
   int dropped;     // the low bits of the depth that the key lacks
   int view_shift;  // the bits of the depth in the key, below the view
   int width;       // the bits of a digit of the radix sort
-  std::uint32_t view_mask;
+  uint32_t view_mask;
 
   __device__ DepthDigits(const DepthRange& range, int n_views) {
     constexpr int kMax = kDepthPasses * kDepthBits;
@@ -174,27 +166,26 @@ struct DepthDigits {
   }
 
   // offset: ordered_bits() of the depth minus that of the smallest depth.
-  __device__ std::uint32_t key(std::uint32_t offset, std::int32_t view) const {
+  __device__ uint32_t key(uint32_t offset, int32_t view) const {
     return (view & view_mask) << view_shift | offset >> dropped;
   }
 };
 
 // The first launch of intersect(). Finds the range of the depths that each block reads (ranges
-// [kRangeBlocks]), one thread per splat in a grid-stride loop, and sets the counters of the following kernels
-// to zero.
+// [kRangeBlocks]), one thread per splat in a grid-stride loop, and clears the counters of later kernels.
 __global__ void __launch_bounds__(kRangeThreads)
-    range_kernel(const IntersectInput<float> in, DepthRange* ranges, uint4* zeros, std::int64_t n_zeros) {
+    range_kernel(const IntersectInput<float> in, DepthRange* ranges, uint4* zeros, int64_t n_zeros) {
   wait_for_earlier_kernels();
-  const std::int64_t n = valid_splat_count(in);
-  constexpr std::int64_t kStep = kRangeBlocks * kRangeThreads;
-  const std::int64_t thread = blockIdx.x * static_cast<std::int64_t>(kRangeThreads) + threadIdx.x;
+  const int64_t n = valid_splat_count(in);
+  constexpr int64_t kStep = kRangeBlocks * kRangeThreads;
+  const int64_t thread = blockIdx.x * int64_t(kRangeThreads) + threadIdx.x;
   DepthRange range{0xffffffffu, 0u};
 #pragma unroll 8
-  for (std::int64_t i = thread; i < n; i += kStep) {
-    const std::uint32_t bits = ordered_bits(in.depths[i]);
+  for (int64_t i = thread; i < n; i += kStep) {
+    const uint32_t bits = ordered_bits(in.depths[i]);
     range = {min(range.low, bits), max(range.high, bits)};
   }
-  for (std::int64_t i = thread; i < n_zeros; i += kStep) zeros[i] = uint4{};
+  for (int64_t i = thread; i < n_zeros; i += kStep) zeros[i] = uint4{};
   range = range.over_block<kRangeThreads>();
   if (threadIdx.x == 0) ranges[blockIdx.x] = range;
 }
@@ -203,14 +194,14 @@ __global__ void __launch_bounds__(kRangeThreads)
 // histograms of the keys' digits [kDepthPasses, kDepthBins]. One thread per splat in a grid-stride loop, with
 // as many blocks as run at a time.
 __global__ void __launch_bounds__(kDepthThreads, kDepthBlocks)
-    depth_keys_kernel(const IntersectInput<float> in, const DepthRange* ranges, std::uint32_t* keys,
-                      Touched* touched, std::uint64_t* histograms, int* dropped_bits, int* width,
-                      std::int64_t* n_splats) {
-  __shared__ std::uint32_t counts[kDepthPasses][kDepthBins];
+    depth_keys_kernel(const IntersectInput<float> in, const DepthRange* ranges, uint32_t* keys,
+                      Touched* touched, uint64_t* histograms, int* dropped_bits, int* width,
+                      int64_t* n_splats) {
+  __shared__ uint32_t counts[kDepthPasses][kDepthBins];
   for (int bin = threadIdx.x; bin < kDepthPasses * kDepthBins; bin += kDepthThreads) counts[0][bin] = 0;
   wait_for_earlier_kernels();
   // The number is below 2^31, and a 64-bit loop counter would need more registers than there are.
-  const auto n = static_cast<std::uint32_t>(valid_splat_count(in));
+  const auto n = uint32_t(valid_splat_count(in));
   const DepthRange range =
       ranges[threadIdx.x].over_block<kDepthThreads>();  // also a barrier for the zeroed counters
   const DepthDigits digits(range, in.grid.n_cameras);
@@ -220,10 +211,10 @@ __global__ void __launch_bounds__(kDepthThreads, kDepthBlocks)
     *n_splats = n;
   }
 #pragma unroll 1
-  for (std::uint32_t i = blockIdx.x * kDepthThreads + threadIdx.x; i < n; i += gridDim.x * kDepthThreads) {
+  for (uint32_t i = blockIdx.x * kDepthThreads + threadIdx.x; i < n; i += gridDim.x * kDepthThreads) {
     const float depth = in.depths[i];
     const SplatShape splat = load_splat(in, i);
-    const std::uint32_t key = digits.key(ordered_bits(depth) - range.low, splat.camera);
+    const uint32_t key = digits.key(ordered_bits(depth) - range.low, splat.camera);
     keys[i] = key;
 #pragma unroll
     for (int pass = 0; pass < kDepthPasses; ++pass) {
@@ -235,14 +226,13 @@ __global__ void __launch_bounds__(kDepthThreads, kDepthBlocks)
   add_counts(counts[0], kDepthPasses * kDepthBins, histograms);
 }
 
-// The order (depth, id) of splats whose keys are equal.
 struct SplatOrder {
-  const float* depths;      // null: not compared
-  const std::int64_t* ids;  // null: the splat index
+  const float* depths;  // null: not compared
+  const int64_t* ids;   // null: the splat index
 
-  __device__ bool before(std::int32_t a, std::int32_t b) const {
+  __device__ bool before(int32_t a, int32_t b) const {
     if (depths) {
-      const std::uint32_t depth_a = ordered_bits(depths[a]), depth_b = ordered_bits(depths[b]);
+      const uint32_t depth_a = ordered_bits(depths[a]), depth_b = ordered_bits(depths[b]);
       if (depth_a != depth_b) return depth_a < depth_b;
     }
     return ids ? ids[a] < ids[b] : a < b;
@@ -250,16 +240,16 @@ struct SplatOrder {
 
   // A bitonic sort by all threads of a block. Every comparison puts the smaller splat first, so the number of
   // splats need not be a power of two.
-  __device__ void sort(std::int32_t* splats, std::int64_t n) const {
-    for (std::int64_t size = 2; size < 2 * n; size *= 2) {
-      for (std::int64_t step = size / 2; step > 0; step /= 2) {
+  __device__ void sort(int32_t* splats, int64_t n) const {
+    for (int64_t size = 2; size < 2 * n; size *= 2) {
+      for (int64_t step = size / 2; step > 0; step /= 2) {
         __syncthreads();
-        for (std::int64_t i = threadIdx.x; i < (n + 2 * step - 1) / (2 * step) * step; i += blockDim.x) {
-          const std::int64_t at = i & (step - 1), group = 2 * (i - at), low = group + at;
+        for (int64_t i = threadIdx.x; i < (n + 2 * step - 1) / (2 * step) * step; i += blockDim.x) {
+          const int64_t at = i & (step - 1), group = 2 * (i - at), low = group + at;
           // The first step of a size mirrors its upper half.
-          const std::int64_t high = 2 * step == size ? group + size - 1 - at : low + step;
+          const int64_t high = 2 * step == size ? group + size - 1 - at : low + step;
           if (high < n && before(splats[high], splats[low])) {
-            const std::int32_t splat = splats[low];
+            const int32_t splat = splats[low];
             splats[low] = splats[high];
             splats[high] = splat;
           }
@@ -274,28 +264,28 @@ struct SplatOrder {
 // splat; the thread of a run's first splat orders the run if it is short, which is the usual case. The
 // threads of a block order longer runs together, one run after the other.
 __global__ void __launch_bounds__(kDepthThreads)
-    order_ties_kernel(const std::uint32_t* keys, std::int32_t* splats, const std::int64_t* n_splats,
-                      SplatOrder order, const int* dropped_bits) {
-  __shared__ std::int64_t long_runs[kTieSplats / kShortRun + 1];
+    order_ties_kernel(const uint32_t* keys, int32_t* splats, const int64_t* n_splats, SplatOrder order,
+                      const int* dropped_bits) {
+  __shared__ int64_t long_runs[kTieSplats / kShortRun + 1];
   __shared__ int n_long;
   wait_for_earlier_kernels();
-  const std::int64_t n = *n_splats;
+  const int64_t n = *n_splats;
   if (*dropped_bits == 0) {
     if (!order.ids) return;  // the stable sort kept splats of equal depth in order
     order.depths = nullptr;
   }
   if (threadIdx.x == 0) n_long = 0;
   __syncthreads();
-  const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kTieSplats) + threadIdx.x;
+  const int64_t first = blockIdx.x * int64_t(kTieSplats) + threadIdx.x;
   unsigned begins = 0;
 #pragma unroll
   for (int k = 0; k < kTieItems; ++k) {
-    const std::int64_t i = first + k * kDepthThreads;
+    const int64_t i = first + k * kDepthThreads;
     if (i + 1 < n && keys[i] == keys[i + 1] && (i == 0 || keys[i - 1] != keys[i])) begins |= 1u << k;
   }
   for (; begins; begins &= begins - 1) {
-    const std::int64_t i = first + (__ffs(begins) - 1) * kDepthThreads;
-    std::int32_t* const run = splats + i;
+    const int64_t i = first + (__ffs(begins) - 1) * kDepthThreads;
+    int32_t* const run = splats + i;
     int length = 2;
     while (length <= kShortRun && i + length < n && keys[i + length] == keys[i]) ++length;
     if (length > kShortRun) {
@@ -303,7 +293,7 @@ __global__ void __launch_bounds__(kDepthThreads)
       continue;
     }
     for (int at = 1; at < length; ++at) {
-      const std::int32_t splat = run[at];
+      const int32_t splat = run[at];
       int to = at;
       for (; to > 0 && order.before(splat, run[to - 1]); --to) run[to] = run[to - 1];
       if (to < at) run[to] = splat;
@@ -311,10 +301,10 @@ __global__ void __launch_bounds__(kDepthThreads)
   }
   __syncthreads();
   for (int k = 0; k < n_long; ++k) {
-    const std::int64_t begin = long_runs[k];
-    std::int64_t length = 0;
+    const int64_t begin = long_runs[k];
+    int64_t length = 0;
     for (int same = kDepthThreads; same == kDepthThreads; length += same) {
-      const std::int64_t i = begin + length + threadIdx.x;
+      const int64_t i = begin + length + threadIdx.x;
       same = __syncthreads_count(i < n && keys[i] == keys[begin]);
     }
     order.sort(splats + begin, length);

@@ -13,44 +13,35 @@
 // known_splats: null, or the number of splats in device memory (common/kernel.h; CUDA only).
 //
 // capacity is the length of isect_splats; entries from tile_offsets[B*T] on are unspecified. If there are
-// more entries than the capacity, the CPU kernel returns their number and writes no list, and the op fails
-// with both numbers. On CUDA the op counts the entries first, for which the host waits, and fails in the same
-// way. With `unchecked` the op does not count on CUDA: the kernels then list the first `capacity` entries in
-// depth order, with consistent offsets, and the caller has to compare the number of entries, which it gets
-// from the projection, with the capacity.
+// more entries, the CPU kernel returns their number and writes no list, and the op fails with both numbers.
+// On CUDA the op counts the entries first, for which the host waits, and fails in the same way; `unchecked`,
+// it does not: the kernels then list the first `capacity` entries in depth order, with consistent offsets,
+// and the caller has to compare the capacity with the number of entries, which it gets from the projection.
 //
 // The lists depend on the splats alone and not on the number of threads. The splats may come in any order.
 // The cost is O(P) for the radix sort, O(tile rows) for the tests and O(I) to write. Counts are 64-bit; P and
 // B*T must be below 2^31.
 #pragma once
-#include <cstdint>
-
-#include "common/kernel.h"
 #include "math/tiles.h"
 
 namespace blitzgs {
 
-template <class T>
-struct IntersectInput {
-  const T* means2d;
-  const T* conics;
-  const T* opacities;
-  const T* depths;
-  const std::int32_t* camera_ids;
-  const std::int64_t* ids;
-  std::int64_t n_splats;
+template <class T> struct IntersectInput {
+  const T *means2d, *conics, *opacities, *depths;
+  const int32_t* camera_ids;
+  const int64_t* ids;
+  int64_t n_splats;
   TileGrid grid;
-  const std::int64_t* known_splats = nullptr;
+  const int64_t* known_splats = nullptr;
 };
 
 namespace BLITZGS_BACKEND {
 // On CUDA it waits for the device, because the host needs the count.
-template <class T>
-std::int64_t count_intersections(const IntersectInput<T>& in, Workspace&, CudaStream);
+template <class T> int64_t count_intersections(const IntersectInput<T>& in, Workspace&, CudaStream);
 // On CUDA it does not wait for the device, and returns the capacity.
 template <class T>
-std::int64_t intersect(const IntersectInput<T>& in, std::int64_t capacity, std::int32_t* isect_splats,
-                       std::int64_t* tile_offsets, Workspace&, CudaStream);
+int64_t intersect(const IntersectInput<T>& in, int64_t capacity, int32_t* isect_splats, int64_t* tile_offsets,
+                  Workspace&, CudaStream);
 }  // namespace BLITZGS_BACKEND
 
 }  // namespace blitzgs

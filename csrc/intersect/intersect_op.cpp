@@ -8,7 +8,7 @@
 namespace blitzgs {
 namespace {
 
-void check_capacity(std::int64_t capacity, std::int64_t count) {
+void check_capacity(int64_t capacity, int64_t count) {
   BLITZGS_CHECK(count <= capacity, "n_isects is ", capacity, " but there are ", count,
                 " intersections; pass the sum of tiles_touched, or -1 to have them counted");
 }
@@ -17,11 +17,11 @@ void check_capacity(std::int64_t capacity, std::int64_t count) {
 
 Tensors<2> intersect(const Tensor& means2d, const Tensor& conics, const Tensor& splat_opacities,
                      const Tensor& depths, const Tensor& camera_ids, const OptionalTensor& ids, BLITZGS_TILES,
-                     std::int64_t n_isects, const OptionalTensor& known_splats, bool unchecked) {
+                     int64_t n_isects, const OptionalTensor& known_splats, bool unchecked) {
   check_floating("means2d", means2d);
-  const std::int64_t n_splats = means2d.size(0);
-  const auto cameras = checked<std::int32_t>("camera_ids", camera_ids, {n_splats});
-  const auto id_splats = checked<std::int64_t>("ids", ids, {n_splats});
+  const int64_t n_splats = means2d.size(0);
+  const auto cameras = checked<int32_t>("camera_ids", camera_ids, {n_splats});
+  const auto id_splats = checked<int64_t>("ids", ids, {n_splats});
   const auto [valid_splats, known] = checked_splat_count(known_splats, means2d);
   const TileGrid grid = checked_tile_grid(n_cameras, width, height, tile_size, tile_begin, tile_end);
   BLITZGS_CHECK(grid.count() <= INT32_MAX, "tile numbers are 32-bit, got ", grid.count(),
@@ -34,19 +34,19 @@ Tensors<2> intersect(const Tensor& means2d, const Tensor& conics, const Tensor& 
                order = checked<T>("depths", depths, {n_splats});
     const IntersectInput<T> in{means,     shapes,       opacities, order, cameras,
                                id_splats, valid_splats, grid,      known};
-    std::int64_t capacity = n_isects;
+    int64_t capacity = n_isects;
     // On CUDA backend::intersect does not return the number, so the op counts first and waits for the count.
     if (n_isects < 0 || (kOnCuda && !unchecked)) {
-      const std::int64_t needed = backend::count_intersections(in, scope.workspace, scope.stream);
+      const int64_t needed = backend::count_intersections(in, scope.workspace, scope.stream);
       if (n_isects < 0) capacity = needed;
       check_capacity(capacity, needed);
     }
-    const auto offsets = make<std::int64_t>(means, {grid.count() + 1});
+    const auto offsets = make<int64_t>(means, {grid.count() + 1});
     Tensor splats;
-    std::int64_t count = 0;
+    int64_t count = 0;
     try {
-      splats = make<std::int32_t>(means, {capacity});
-      count = backend::intersect(in, capacity, mutable_data<std::int32_t>(splats), offsets, scope.workspace,
+      splats = make<int32_t>(means, {capacity});
+      count = backend::intersect(in, capacity, mutable_data<int32_t>(splats), offsets, scope.workspace,
                                  scope.stream);
     } catch (const std::exception& error) {
       // An error here means that memory ran out. The message states the length of the lists, because it

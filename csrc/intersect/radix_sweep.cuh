@@ -3,15 +3,9 @@
 // The kernel that wrote the keys has counted how often each digit occurs. Each block adds up the counts of
 // each digit in the blocks before it while these run (decoupled look-back, Merrill & Garland 2016; for a
 // radix sort, Adinets & Merrill 2022). It reads the states of several predecessors at a time, because a pass
-// has only a few hundred blocks, which all run at once, and would otherwise spend most of its time on the
-// look-back. The number of pairs is read from device memory.
+// has only a few hundred blocks, which all run at once, and would spend most of its time on the look-back.
 #pragma once
-#include <algorithm>
-#include <cstdint>
-#include <cuda/atomic>
-
 #include "common/cuda.cuh"
-#include "common/kernel.h"
 
 namespace blitzgs::cuda {
 
@@ -20,24 +14,23 @@ inline constexpr int kSweepWindow = 4;  // predecessors whose states are read at
 
 // State: an unsigned integer. The two high bits say what the other bits count (sweep_kernel), so 32-bit
 // states need n_items < kSmallStates.
-template <class Key, class State>
-struct SweepPass {
+template <class Key, class State> struct SweepPass {
   const Key* keys;
-  const std::int32_t* values;  // null: the positions of the keys
+  const int32_t* values;  // null: the positions of the keys
   Key* sorted_keys;
-  std::int32_t* sorted_values;
-  const std::int64_t* n_items;
-  const std::uint64_t* histogram;  // [bins], the number of keys for each value of this digit
-  std::uint64_t* turn;             // zero before the launch
-  State* states;                   // [blocks, bins], zeros before the launch
-  int index;                       // the index of this digit; the lowest digit has index 0
-  int width;                       // bits of each digit
-  const int* known_width;          // null, or the width in device memory if the host does not know it
+  int32_t* sorted_values;
+  const int64_t* n_items;
+  const uint64_t* histogram;  // [bins], the number of keys for each value of this digit
+  uint64_t* turn;             // zero before the launch
+  State* states;              // [blocks, bins], zeros before the launch
+  int index;                  // the index of this digit; the lowest digit has index 0
+  int width;                  // bits of each digit
+  const int* known_width;     // null, or the width in device memory if the host does not know it
 };
 
 // Adds the counts of a block to the histogram of the whole launch. All threads of the block call this.
-__device__ __forceinline__ void add_counts(const std::uint32_t* counts, int bins, std::uint64_t* histogram) {
-  using Word = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;
+__device__ __forceinline__ void add_counts(const uint32_t* counts, int bins, uint64_t* histogram) {
+  using Word = ::cuda::atomic_ref<uint64_t, ::cuda::thread_scope_device>;
   for (int bin = threadIdx.x; bin < bins; bin += blockDim.x) {
     if (counts[bin]) Word(histogram[bin]).fetch_add(counts[bin], ::cuda::memory_order_relaxed);
   }
@@ -49,7 +42,7 @@ __device__ __forceinline__ State count_before(const State* states, unsigned bloc
   using Word = ::cuda::atomic_ref<const State, ::cuda::thread_scope_device>;
   constexpr int kBits = 8 * sizeof(State);
   State sum = 0;
-  for (std::int64_t end = block; end > 0; end -= kSweepWindow) {
+  for (int64_t end = block; end > 0; end -= kSweepWindow) {
     State seen[kSweepWindow];
 #pragma unroll
     for (int k = 0; k < kSweepWindow; ++k) {
@@ -70,8 +63,7 @@ __device__ __forceinline__ State count_before(const State* states, unsigned bloc
 
 // Returns the lanes whose values have the same low bits as this lane's. It is written in PTX because the
 // compiler spends 7 instructions on each bit.
-template <int kBits>
-__device__ __forceinline__ unsigned lanes_with_same(unsigned value) {
+template <int kBits> __device__ __forceinline__ unsigned lanes_with_same(unsigned value) {
   unsigned lanes = kFullWarp;
 #pragma unroll
   for (int bit = 0; bit < kBits; ++bit) {
@@ -93,15 +85,14 @@ template <int kBits, class Key, class State>
 __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass<Key, State> pass) {
   constexpr int kBins = 1 << kBits, kWarps = kSweepThreads / 32;
   static_assert(kBins <= kSweepThreads);
-  // The two flags of a state: the other bits are the block's own count, or the count of all blocks up to and
-  // including this one.
+  // The two flags of a state: the other bits are the block's own count, or that of all blocks up to this one.
   constexpr State kOwn = State{1} << (8 * sizeof(State) - 2), kThrough = kOwn << 1;
-  extern __shared__ std::int32_t staged_values[];
+  extern __shared__ int32_t staged_values[];
   auto* const staged_keys = reinterpret_cast<Key*>(staged_values + kSweepTile);
   // [warps, bins], the counts of each warp; the keys reuse this memory later.
-  auto* const counts = reinterpret_cast<std::uint32_t*>(staged_values + kSweepTile);
+  auto* const counts = reinterpret_cast<uint32_t*>(staged_values + kSweepTile);
   __shared__ State targets[kBins], sums_everywhere[kWarps];
-  __shared__ std::uint32_t sums_here[kWarps];
+  __shared__ uint32_t sums_here[kWarps];
   __shared__ unsigned turn;
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   const int bin = threadIdx.x;  // valid in threads below the number of bins
@@ -109,18 +100,18 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
   wait_for_earlier_kernels();
   if (threadIdx.x == 0) {
     // A block takes its number here, so that all blocks with smaller numbers have started.
-    using Turn = ::cuda::atomic_ref<std::uint64_t, ::cuda::thread_scope_device>;
-    turn = static_cast<unsigned>(Turn(*pass.turn).fetch_add(1, ::cuda::memory_order_relaxed));
+    using Turn = ::cuda::atomic_ref<uint64_t, ::cuda::thread_scope_device>;
+    turn = unsigned(Turn(*pass.turn).fetch_add(1, ::cuda::memory_order_relaxed));
   }
-  const State count_everywhere = bin < kBins ? static_cast<State>(pass.histogram[bin]) : 0;
-  const std::int64_t n = *pass.n_items;
+  const State count_everywhere = bin < kBins ? State(pass.histogram[bin]) : 0;
+  const int64_t n = *pass.n_items;
   const int width = pass.known_width ? *pass.known_width : pass.width, shift = pass.index * width;
-  const auto digit_of = [&](Key key) { return static_cast<unsigned>(key) >> shift & ((1u << width) - 1); };
+  const auto digit_of = [&](Key key) { return unsigned(key) >> shift & ((1u << width) - 1); };
   __syncthreads();
   const unsigned block = turn;
-  const std::int64_t first = block * static_cast<std::int64_t>(kSweepTile);
+  const int64_t first = block * int64_t(kSweepTile);
   if (first >= n) return;
-  const int n_here = n - first < kSweepTile ? static_cast<int>(n - first) : kSweepTile;
+  const int n_here = n - first < kSweepTile ? int(n - first) : kSweepTile;
 
   // A warp handles consecutive pairs, so that pairs of equal digits keep their order. Items after the last
   // pair get the largest digit, so that they come last, and are not written.
@@ -129,15 +120,15 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
 #pragma unroll
   for (int k = 0; k < kSweepItems; ++k) {
     const int at = begin + 32 * k;
-    keys[k] = at < n_here ? pass.keys[first + at] : static_cast<Key>(~Key{0});
+    keys[k] = at < n_here ? pass.keys[first + at] : Key(~Key{0});
   }
-  std::uint32_t places[kSweepItems];
+  uint32_t places[kSweepItems];
 #pragma unroll
   for (int k = 0; k < kSweepItems; ++k) {
     const unsigned digit = digit_of(keys[k]);
     const unsigned peers = lanes_with_same<kBits>(digit);
     const unsigned earlier = peers & ((1u << lane) - 1);
-    const std::uint32_t count = counts[warp * kBins + digit];
+    const uint32_t count = counts[warp * kBins + digit];
     places[k] = count + __popc(earlier);
     __syncwarp();
     if (!earlier) counts[warp * kBins + digit] = count + __popc(peers);
@@ -147,14 +138,14 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
 
   using Word = ::cuda::atomic_ref<State, ::cuda::thread_scope_device>;
   State* const states = pass.states + bin;
-  State* const own_state = states + block * static_cast<std::int64_t>(kBins);
-  std::uint32_t count_here = 0;
+  State* const own_state = states + block * int64_t(kBins);
+  uint32_t count_here = 0;
   if (bin < kBins) {
 #pragma unroll
     for (int w = 0; w < kWarps; ++w) count_here += counts[w * kBins + bin];
     Word(*own_state).store((block ? kOwn : kThrough) | count_here, ::cuda::memory_order_relaxed);
   }
-  const std::uint32_t sum_here = sum_of_lanes_until(count_here, lane);
+  const uint32_t sum_here = sum_of_lanes_until(count_here, lane);
   const State sum_everywhere = sum_of_lanes_until(count_everywhere, lane);
   if (lane == 31) {
     sums_here[warp] = sum_here;
@@ -163,7 +154,7 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
   __syncthreads();
   State target = sum_everywhere - count_everywhere;
   if (bin < kBins) {
-    std::uint32_t start = sum_here - count_here;  // the position of the bin's first pair in this block
+    uint32_t start = sum_here - count_here;  // the position of the bin's first pair in this block
     for (int w = 0; w < warp; ++w) {
       start += sums_here[w];
       target += sums_everywhere[w];
@@ -171,7 +162,7 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
     target -= start;
 #pragma unroll
     for (int w = 0; w < kWarps; ++w) {
-      const std::uint32_t count = counts[w * kBins + bin];
+      const uint32_t count = counts[w * kBins + bin];
       counts[w * kBins + bin] = start;
       start += count;
     }
@@ -182,11 +173,11 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
   __syncthreads();
 #pragma unroll
   for (int k = 0; k < kSweepItems; ++k) staged_keys[places[k]] = keys[k];
-  std::int32_t values[kSweepItems];
+  int32_t values[kSweepItems];
 #pragma unroll
   for (int k = 0; k < kSweepItems; ++k) {
     const int at = begin + 32 * k;
-    values[k] = static_cast<std::int32_t>(first + at);
+    values[k] = int32_t(first + at);
     if (pass.values && at < n_here) values[k] = pass.values[first + at];
   }
   if (bin < kBins) {
@@ -197,8 +188,7 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
 #pragma unroll
   for (int k = 0; k < kSweepItems; ++k) staged_values[places[k]] = values[k];
   __syncthreads();
-  // The pairs of one digit are neighbours in shared memory, so neighbouring threads write to neighbouring
-  // addresses.
+  // The pairs of one digit are neighbours in shared memory, so neighbouring threads write side by side.
 #pragma unroll
   for (int k = 0; k < kSweepItems; ++k) {
     const int at = threadIdx.x + k * kSweepThreads;
@@ -212,9 +202,8 @@ __global__ void __launch_bounds__(kSweepThreads, 2) sweep_kernel(const SweepPass
 
 template <int kBits, class Key, class State>
 void sweep(const SweepPass<Key, State>& pass, unsigned blocks, CudaStream stream) {
-  constexpr std::size_t kCounts = kSweepThreads / 32 * sizeof(std::uint32_t) << kBits;
-  constexpr std::size_t kBytes =
-      kSweepTile * sizeof(std::int32_t) + std::max(kSweepTile * sizeof(Key), kCounts);
+  constexpr size_t kCounts = kSweepThreads / 32 * sizeof(uint32_t) << kBits;
+  constexpr size_t kBytes = kSweepTile * sizeof(int32_t) + std::max(kSweepTile * sizeof(Key), kCounts);
   launch_early("radix sweep", sweep_kernel<kBits, Key, State>, {blocks, kSweepThreads, stream, kBytes}, pass);
 }
 

@@ -4,9 +4,8 @@
 #include "io/byte_reader.h"
 
 namespace blitzgs::io {
-
 namespace {
-constexpr std::uint64_t kBufferBytes = 1 << 18;
+constexpr uint64_t kBufferBytes = 1 << 18;
 
 std::string printable(const std::string& text) {
   constexpr const char* kHex = "0123456789abcdef";
@@ -33,31 +32,31 @@ ByteReader::ByteReader(std::istream& in, std::string name) : in_(in), name_(std:
   const auto end = in_.tellg();
   in_.seekg(start);
   if (!in_ || start < 0 || end < start) throw FormatError(name_, "cannot be read, or its size is unknown");
-  size_ = static_cast<std::uint64_t>(end - start);
+  size_ = uint64_t(end - start);
   buffer_.resize(std::min(size_, kBufferBytes));
 }
 
 void ByteReader::fill() {
-  const std::uint64_t wanted = std::min<std::uint64_t>(buffer_.size(), remaining());
+  const uint64_t wanted = std::min<uint64_t>(buffer_.size(), remaining());
   in_.read(buffer_.data(), static_cast<std::streamsize>(wanted));
-  if (static_cast<std::uint64_t>(in_.gcount()) != wanted) fail("the file could not be read on");
+  if (uint64_t(in_.gcount()) != wanted) fail("the file could not be read on");
   buffer_at_ = 0;
   buffer_end_ = wanted;
 }
 
-void ByteReader::require(std::uint64_t n, const char* what) const {
+void ByteReader::require(uint64_t n, const char* what) const {
   if (n > remaining()) {
     fail(std::string("the file ends inside ") + what + " (" + std::to_string(n) + " bytes needed, " +
          std::to_string(remaining()) + " left)");
   }
 }
 
-void ByteReader::read_bytes(void* destination, std::uint64_t n, const char* what) {
+void ByteReader::read_bytes(void* destination, uint64_t n, const char* what) {
   require(n, what);
   char* out = static_cast<char*>(destination);
   while (n > 0) {
     if (buffer_at_ == buffer_end_) fill();
-    const std::uint64_t step = std::min<std::uint64_t>(n, buffer_end_ - buffer_at_);
+    const uint64_t step = std::min<uint64_t>(n, buffer_end_ - buffer_at_);
     if (out) out = std::copy_n(buffer_.data() + buffer_at_, step, out);
     n -= step;
     buffer_at_ += step;
@@ -74,20 +73,20 @@ std::string ByteReader::read_c_string(const char* what) {
     const char* end = buffer_.data() + buffer_end_;
     const char* nul = std::find(begin, end, '\0');
     text.append(begin, nul);
-    const std::size_t step = static_cast<std::size_t>(nul - begin) + (nul != end ? 1 : 0);
+    const size_t step = size_t(nul - begin) + (nul != end ? 1 : 0);
     buffer_at_ += step;
     offset_ += step;
     if (nul != end) return text;
   }
 }
 
-std::uint64_t ByteReader::read_count(std::uint64_t min_bytes, const char* what) {
-  const auto count = read<std::uint64_t>(what);
+uint64_t ByteReader::read_count(uint64_t min_bytes, const char* what) {
+  const auto count = read<uint64_t>(what);
   check_count(count, min_bytes, what);
   return count;
 }
 
-void ByteReader::check_count(std::uint64_t count, std::uint64_t min_bytes, const char* what) const {
+void ByteReader::check_count(uint64_t count, uint64_t min_bytes, const char* what) const {
   if (count > remaining() / min_bytes) {
     fail("it claims " + std::to_string(count) + " " + what + " of at least " + std::to_string(min_bytes) +
          " bytes each, but " + std::to_string(remaining()) + " bytes are left");

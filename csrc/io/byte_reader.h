@@ -15,8 +15,7 @@
 #include <type_traits>
 #include <vector>
 
-// Checked reading of untrusted binary data: before a reader allocates or skips bytes, it checks that the file
-// has so many.
+// Checked reading of untrusted binary data: a reader that allocates or skips bytes has checked their number.
 namespace blitzgs::io {
 
 static_assert(std::endian::native == std::endian::little, "the binary formats are little endian");
@@ -35,51 +34,47 @@ class ByteReader {
   // `name` is the name of the stream in messages. Throws FormatError if the size of the stream is unknown.
   ByteReader(std::istream& in, std::string name);
 
-  std::uint64_t offset() const { return offset_; }
-  std::uint64_t remaining() const { return size_ - offset_; }
+  uint64_t offset() const { return offset_; }
+  uint64_t remaining() const { return size_ - offset_; }
 
   // Reads a value of fixed size; `what` names it in the message if the file ends first.
-  template <class T>
-  T read(const char* what) {
+  template <class T> T read(const char* what) {
     static_assert(std::is_trivially_copyable_v<T>);
     T value;
     read_bytes(&value, sizeof value, what);
     return value;
   }
-  void read_bytes(void* destination, std::uint64_t n, const char* what);  // null: skips them
-  void skip(std::uint64_t n, const char* what) { read_bytes(nullptr, n, what); }
+  void read_bytes(void* destination, uint64_t n, const char* what);  // null: skips them
+  void skip(uint64_t n, const char* what) { read_bytes(nullptr, n, what); }
   std::string read_c_string(const char* what);
 
-  // Reads a uint64 count of records of at least `min_bytes` bytes each. Throws if the file has fewer bytes
-  // left.
-  std::uint64_t read_count(std::uint64_t min_bytes, const char* what);
-  void check_count(std::uint64_t count, std::uint64_t min_bytes, const char* what) const;
+  // Reads a uint64 count of records of at least `min_bytes` bytes each. Throws if fewer are left.
+  uint64_t read_count(uint64_t min_bytes, const char* what);
+  void check_count(uint64_t count, uint64_t min_bytes, const char* what) const;
 
-  // Throws FormatError at the current offset.
   [[noreturn]] void fail(const std::string& reason) const;
   // Throws if bytes are left, because the file then has another format than the reader expects.
   void expect_end() const;
 
  private:
-  void require(std::uint64_t n, const char* what) const;
+  void require(uint64_t n, const char* what) const;
   void fill();
 
   std::istream& in_;
   std::string name_;
-  std::uint64_t size_ = 0;
-  std::uint64_t offset_ = 0;
+  uint64_t size_ = 0;
+  uint64_t offset_ = 0;
   std::vector<char> buffer_;
-  std::size_t buffer_at_ = 0;
-  std::size_t buffer_end_ = 0;
+  size_t buffer_at_ = 0;
+  size_t buffer_end_ = 0;
 };
 
 // Lines and numbers of untrusted text, independent of the locale.
 
-// Reads all of `text` as a number; false if it is none. A sign + is allowed, which std::from_chars refuses.
-// A real number beyond the range of T becomes zero or infinity with its sign, as it does in other readers; an
+// Reads all of `text` as a number; false if it is none. A sign + is allowed, which std::from_chars refuses. A
+// real number beyond the range of T becomes zero or infinity with its sign, as it does in other readers; an
 // integer beyond it is refused.
-template <class T>
-bool parse_number(std::string_view text, T& value) {
+template <class T> bool parse_number(std::string_view text, T& value) {
   if (text.starts_with('+')) {
     text.remove_prefix(1);
     if (text.starts_with('-')) return false;
@@ -109,7 +104,6 @@ class TextReader {
     if (!in_) throw FormatError(name_, "cannot be read");
   }
 
-  // Goes to the next line; false at the end of the file.
   bool next_line();
   // Goes to the next line that is not blank and no comment (#); false at the end of the file.
   bool next_record();
@@ -117,18 +111,15 @@ class TextReader {
   // The next token of the line. Throws if the line has no more; `what` names the token in the message.
   std::string_view token(const char* what);
   bool has_token();
-  // The rest of the line, without surrounding blanks.
   std::string_view rest();
 
-  template <class T>
-  T number(const char* what) {
+  template <class T> T number(const char* what) {
     const std::string_view text = token(what);
     T value{};
     if (!parse_number(text, value)) fail("'" + std::string(text.substr(0, 40)) + "' is not a valid " + what);
     return value;
   }
 
-  // Throws FormatError at the current line.
   [[noreturn]] void fail(const std::string& reason) const;
 
  private:
@@ -138,7 +129,7 @@ class TextReader {
   std::string name_;
   std::string line_;
   std::string_view left_;
-  std::uint64_t line_number_ = 0;
+  uint64_t line_number_ = 0;
 };
 
 }  // namespace blitzgs::io

@@ -8,11 +8,7 @@
 // multiple of the file's size. Newer models also have rigs and frames files; they are not needed, because the
 // images file still holds the pose of each image.
 #pragma once
-#include <cstdint>
 #include <iosfwd>
-#include <string>
-#include <string_view>
-#include <vector>
 
 #include "io/byte_reader.h"
 
@@ -30,36 +26,36 @@ const CameraModel* find_camera_model(int id);
 const CameraModel* find_camera_model(std::string_view name);
 
 struct ColmapCamera {
-  std::uint32_t id = 0;
+  uint32_t id = 0;
   int model = 0;
-  std::uint64_t width = 0;
-  std::uint64_t height = 0;
+  uint64_t width = 0;
+  uint64_t height = 0;
   std::vector<double> params;
 };
 
 // N registered images, one column per field. Observations of image i are rows [point2d_offsets[i],
 // point2d_offsets[i + 1]); all offsets are 0 if observations were not requested.
 struct ColmapImages {
-  std::vector<std::uint32_t> ids;
-  std::vector<std::uint32_t> camera_ids;
+  std::vector<uint32_t> ids;
+  std::vector<uint32_t> camera_ids;
   std::vector<double> quats;         // [N, 4] w, x, y, z
   std::vector<double> translations;  // [N, 3]
   std::vector<std::string> names;
-  std::vector<std::uint64_t> point2d_offsets;  // [N + 1]
-  std::vector<double> points2d;                // [O, 2] pixels
-  std::vector<std::int64_t> point3d_ids;       // [O], -1 = no 3D point
+  std::vector<uint64_t> point2d_offsets;  // [N + 1]
+  std::vector<double> points2d;           // [O, 2] pixels
+  std::vector<int64_t> point3d_ids;       // [O], -1 = no 3D point
 };
 
 // M points. The track of point i is rows [track_offsets[i], track_offsets[i + 1]). The offsets are always
 // filled in; the rows are empty if tracks were not requested.
 struct ColmapPoints {
-  std::vector<std::int64_t> ids;
-  std::vector<double> positions;     // [M, 3]
-  std::vector<std::uint8_t> colors;  // [M, 3]
-  std::vector<double> errors;        // [M] mean reprojection error in pixels, -1 = unknown
-  std::vector<std::uint64_t> track_offsets;
-  std::vector<std::uint32_t> track_image_ids;
-  std::vector<std::uint32_t> track_point2d_ids;
+  std::vector<int64_t> ids;
+  std::vector<double> positions;  // [M, 3]
+  std::vector<uint8_t> colors;    // [M, 3]
+  std::vector<double> errors;     // [M] mean reprojection error in pixels, -1 = unknown
+  std::vector<uint64_t> track_offsets;
+  std::vector<uint32_t> track_image_ids;
+  std::vector<uint32_t> track_point2d_ids;
 };
 
 std::vector<ColmapCamera> read_cameras_binary(std::istream& in, const std::string& name);

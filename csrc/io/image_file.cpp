@@ -8,29 +8,26 @@
 #include <algorithm>
 #include <array>
 #include <cerrno>
-#include <cstring>
-#include <string_view>
 
 namespace blitzgs::io {
-
 namespace {
 
 using namespace std::string_view_literals;
 
 constexpr std::string_view kPngStart = "\x89PNG\r\n\x1a\n"sv;
-constexpr std::size_t kReadAhead = 1 << 16;
+constexpr size_t kReadAhead = 1 << 16;
 
 // Tables of the checksum of a byte that k zero bytes follow, for the polynomial of PNG (ISO/IEC 15948, D).
 constexpr auto kChecksums = [] {
-  std::array<std::array<std::uint32_t, 256>, 8> tables{};
-  for (std::uint32_t byte = 0; byte < 256; ++byte) {
-    std::uint32_t value = byte;
+  std::array<std::array<uint32_t, 256>, 8> tables{};
+  for (uint32_t byte = 0; byte < 256; ++byte) {
+    uint32_t value = byte;
     for (int bit = 0; bit < 8; ++bit) value = value >> 1 ^ (value & 1 ? 0xedb88320u : 0u);
     tables[0][byte] = value;
   }
-  for (std::size_t k = 1; k < tables.size(); ++k) {
-    for (std::size_t byte = 0; byte < 256; ++byte) {
-      const std::uint32_t before = tables[k - 1][byte];
+  for (size_t k = 1; k < tables.size(); ++k) {
+    for (size_t byte = 0; byte < 256; ++byte) {
+      const uint32_t before = tables[k - 1][byte];
       tables[k][byte] = before >> 8 ^ tables[0][before & 0xff];
     }
   }
@@ -38,22 +35,22 @@ constexpr auto kChecksums = [] {
 }();
 
 // Eight bytes at a time, because a step of one byte waits for the one before.
-std::uint32_t checksum(ImageBytes bytes) {
-  std::uint32_t value = ~0u;
+uint32_t checksum(ImageBytes bytes) {
+  uint32_t value = ~0u;
   for (; bytes.size() >= 8; bytes = bytes.subspan(8)) {
-    std::uint64_t word = 0;
+    uint64_t word = 0;
     std::memcpy(&word, bytes.data(), 8);
     word ^= value;
     value = 0;
-    for (std::size_t k = 0; k < 8; ++k) value ^= kChecksums[7 - k][word >> 8 * k & 0xff];
+    for (size_t k = 0; k < 8; ++k) value ^= kChecksums[7 - k][word >> 8 * k & 0xff];
   }
-  for (const std::uint8_t byte : bytes) value = value >> 8 ^ kChecksums[0][(value ^ byte) & 0xff];
+  for (const uint8_t byte : bytes) value = value >> 8 ^ kChecksums[0][(value ^ byte) & 0xff];
   return ~value;
 }
 
 void check_png(ImageBytes file, const std::string& name) {
   bool has_pixels = false;
-  for (std::size_t at = kPngStart.size();;) {
+  for (size_t at = kPngStart.size();;) {
     const auto fail = [&](const char* reason) {
       throw FormatError(name + ": at byte " + std::to_string(at), reason);
     };
@@ -75,25 +72,24 @@ void check_png(ImageBytes file, const std::string& name) {
   if (!has_pixels) throw FormatError(name, "damaged PNG: it has no image data");
 }
 
-// Closes a file at the end of its scope.
 struct File {
   int number;
   ~File() { ::close(number); }
 };
 
-std::vector<std::uint8_t> read_file(const std::string& path) {
+std::vector<uint8_t> read_file(const std::string& path) {
   const File file{::open(path.c_str(), O_RDONLY | O_CLOEXEC)};
   struct stat about{};
   if (file.number < 0 || ::fstat(file.number, &about) != 0) throw SystemError(errno, path);
   // One byte more than the file has, so that the read that fills the memory also finds the end.
-  std::vector<std::uint8_t> bytes(static_cast<std::size_t>(std::max<off_t>(about.st_size, 0)) + 1);
-  std::size_t size = 0;
+  std::vector<uint8_t> bytes(size_t(std::max<off_t>(about.st_size, 0)) + 1);
+  size_t size = 0;
   while (true) {
     const ssize_t count = ::read(file.number, bytes.data() + size, bytes.size() - size);
     if (count < 0 && errno == EINTR) continue;
     if (count < 0) throw SystemError(errno, path);
     if (count == 0) break;
-    size += static_cast<std::size_t>(count);
+    size += size_t(count);
     if (size == bytes.size()) bytes.resize(size + kReadAhead);
   }
   bytes.resize(size);
@@ -107,8 +103,8 @@ void check_image(ImageBytes file, const std::string& name) {
   if (text_of(file).starts_with(kPngStart)) check_png(file, name);
 }
 
-std::vector<std::uint8_t> read_image_file(const std::string& path) {
-  std::vector<std::uint8_t> bytes = read_file(path);
+std::vector<uint8_t> read_image_file(const std::string& path) {
+  std::vector<uint8_t> bytes = read_file(path);
   check_image(bytes, path);
   return bytes;
 }

@@ -2,27 +2,22 @@
 // Reads image files whole, and refuses those whose damage a decoder would conceal or only print; reads and
 // writes QOI, and reads headers.
 #pragma once
-#include <cstdint>
 #include <optional>
 #include <span>
-#include <stdexcept>
-#include <string>
-#include <string_view>
-#include <vector>
 
 #include "io/byte_reader.h"
 
 namespace blitzgs::io {
 
-using ImageBytes = std::span<const std::uint8_t>;
+using ImageBytes = std::span<const uint8_t>;
 
 inline std::string_view text_of(ImageBytes bytes) {
   return {reinterpret_cast<const char*>(bytes.data()), bytes.size()};
 }
 
 // The number of `bytes` bytes from `at` on, which must be there.
-inline std::uint64_t big_endian(ImageBytes file, std::size_t at, unsigned bytes) {
-  std::uint64_t value = 0;
+inline uint64_t big_endian(ImageBytes file, size_t at, unsigned bytes) {
+  uint64_t value = 0;
   for (unsigned k = 0; k < bytes; ++k) value = value << 8 | file[at + k];
   return value;
 }
@@ -40,7 +35,7 @@ class SystemError : public std::runtime_error {
 void check_image(ImageBytes file, const std::string& name);
 
 // The bytes of a file that passes `check_image`.
-std::vector<std::uint8_t> read_image_file(const std::string& path);
+std::vector<uint8_t> read_image_file(const std::string& path);
 
 // Checks that a JPEG is complete. Decoders hide damage: they fill missing blocks with grey and report no
 // error.
@@ -59,36 +54,36 @@ void check_jpeg(ImageBytes file, const std::string& name);
 // The QOI image format (qoiformat.org), RGB only: lossless, about the size of PNG, decoded several times
 // faster. O(pixels), deterministic.
 struct QoiSize {
-  std::uint32_t width;
-  std::uint32_t height;
+  uint32_t width;
+  uint32_t height;
 };
 
 // rgb: [height, width, 3] contiguous.
-std::vector<std::uint8_t> encode_qoi(const std::uint8_t* rgb, QoiSize size);
+std::vector<uint8_t> encode_qoi(const uint8_t* rgb, QoiSize size);
 
 // The size in the header; throws FormatError when the header is damaged, has an alpha channel, or claims more
 // pixels than the bytes after it can hold.
 QoiSize qoi_size(ImageBytes file);
 
 // Fills rgb [height, width, 3] of qoi_size(file); throws FormatError when the codes end early or run over.
-void decode_qoi(ImageBytes file, std::uint8_t* rgb);
+void decode_qoi(ImageBytes file, uint8_t* rgb);
 
 // What the header of an image file says, without its pixels: format, size, EXIF orientation, bands, and which
 // of them is alpha. Decoders guess where a file does not say (a fourth band of an aerial camera becomes
 // alpha), so the file is asked here.
 
-enum class Alpha : std::uint8_t {
+enum class Alpha : uint8_t {
   kNone,
   kStraight,    // colours are as without alpha
   kAssociated,  // colours are multiplied by alpha already
 };
 
-enum class Samples : std::uint8_t { kUnsigned, kSigned, kFloat };
+enum class Samples : uint8_t { kUnsigned, kSigned, kFloat };
 
 struct ImageHeader {
   std::string format;  // "JPEG", "TIFF", ...; empty: not known
   bool supported = true;
-  std::uint64_t width = 0, height = 0;  // 0: only the decoder knows
+  uint64_t width = 0, height = 0;  // 0: only the decoder knows
   unsigned orientation = 1;
   unsigned bits = 8;    // of a sample
   unsigned colors = 3;  // bands that are colours
@@ -108,9 +103,8 @@ ImageHeader read_image_header(ImageBytes file, const std::string& name);
 // A TIFF file with the orientation 1 and its alpha marked as associated: OpenCV turns TIFF files by their tag
 // whatever the flags, and libtiff multiplies colours by an alpha that is not associated. Empty: nothing needs
 // to change.
-std::vector<std::uint8_t> tiff_as_stored(ImageBytes file, const std::string& name);
+std::vector<uint8_t> tiff_as_stored(ImageBytes file, const std::string& name);
 
-// Parts of read_image_header.
 ImageHeader read_tiff_header(ImageBytes file, const std::string& name);
 bool is_tiff(ImageBytes file);
 unsigned exif_orientation(ImageBytes tiff);  // 1 if there is none, or none that makes sense

@@ -2,10 +2,8 @@
 #include "io/image_file.h"
 
 #include <algorithm>
-#include <string_view>
 
 namespace blitzgs::io {
-
 namespace {
 
 using namespace std::string_view_literals;
@@ -14,10 +12,10 @@ ImageHeader not_supported(std::string format) { return {.format = std::move(form
 
 ImageHeader read_jpeg(ImageBytes file, const std::string& name) {
   ImageHeader header{.format = "JPEG", .is_lossy = true};
-  const auto need = [&](std::size_t end) {
+  const auto need = [&](size_t end) {
     if (end > file.size()) throw FormatError(name, "truncated JPEG: the file ends inside its header");
   };
-  std::size_t at = 2;
+  size_t at = 2;
   while (true) {
     need(at + 4);
     // Decoders skip what lies between two segments.
@@ -30,7 +28,7 @@ ImageHeader read_jpeg(ImageBytes file, const std::string& name) {
       at += 2;
       continue;
     }
-    const auto length = static_cast<std::size_t>(big_endian(file, at + 2, 2));
+    const auto length = size_t(big_endian(file, at + 2, 2));
     need(at + 2 + length);
     if (length < 2 || marker == 0xda || marker == 0xd9) break;
     const ImageBytes payload = file.subspan(at + 4, length - 2);
@@ -52,16 +50,16 @@ ImageHeader read_jpeg(ImageBytes file, const std::string& name) {
 
 ImageHeader read_png(ImageBytes file, const std::string& name) {
   ImageHeader header{.format = "PNG"};
-  std::size_t at = 8;
+  size_t at = 8;
   unsigned kind = 0;
   while (true) {
     if (file.size() < at + 8) throw FormatError(name, "truncated PNG: the file ends inside its header");
-    const std::uint64_t length = big_endian(file, at, 4);
+    const uint64_t length = big_endian(file, at, 4);
     const std::string_view chunk = text_of(file).substr(at + 4, 4);
     if (chunk == "IDAT" || chunk == "IEND") break;
     if (length > file.size() - at - 8)
       throw FormatError(name, "truncated PNG: the file ends inside its header");
-    const ImageBytes payload = file.subspan(at + 8, static_cast<std::size_t>(length));
+    const ImageBytes payload = file.subspan(at + 8, size_t(length));
     if (chunk == "IHDR" && payload.size() >= 13) {
       header.width = big_endian(payload, 0, 4);
       header.height = big_endian(payload, 4, 4);
@@ -71,29 +69,27 @@ ImageHeader read_png(ImageBytes file, const std::string& name) {
       if (kind == 4 || kind == 6) header.alpha = Alpha::kStraight;
     }
     if (chunk == "tRNS" && kind == 0 && payload.size() >= 2) {
-      header.transparent_grey = static_cast<unsigned>(big_endian(payload, 0, 2));
+      header.transparent_grey = unsigned(big_endian(payload, 0, 2));
     }
     if (chunk == "tRNS" && (kind == 0 || kind == 2 || kind == 3)) header.alpha = Alpha::kStraight;
-    at += 12 + static_cast<std::size_t>(length);
+    at += 12 + size_t(length);
   }
   return header;
 }
 
 // Calls `visit(kind, payload)` for the boxes of a JPEG 2000, HEIF or AVIF file or of one of their boxes. The
 // last one may be cut off: the codestream is not needed.
-template <class Visit>
-void each_box(ImageBytes bytes, Visit visit) {
+template <class Visit> void each_box(ImageBytes bytes, Visit visit) {
   while (bytes.size() >= 8) {
-    std::uint64_t length = big_endian(bytes, 0, 4), header = 8;
+    uint64_t length = big_endian(bytes, 0, 4), header = 8;
     if (length == 1 && bytes.size() >= 16) {
       length = big_endian(bytes, 8, 8);
       header = 16;
     }
     if (length == 0 || length > bytes.size()) length = bytes.size();
     if (length < header) return;
-    visit(text_of(bytes).substr(4, 4),
-          bytes.subspan(static_cast<std::size_t>(header), static_cast<std::size_t>(length - header)));
-    bytes = bytes.subspan(static_cast<std::size_t>(length));
+    visit(text_of(bytes).substr(4, 4), bytes.subspan(size_t(header), size_t(length - header)));
+    bytes = bytes.subspan(size_t(length));
   }
 }
 
@@ -102,20 +98,20 @@ ImageHeader read_jpeg_2000(ImageBytes file) {
   unsigned bands = 3;
   // The first segment of a bare codestream has the size and the number of bands.
   if (file[0] == 0xff && file.size() >= 43) {
-    bands = static_cast<unsigned>(big_endian(file, 40, 2));
+    bands = unsigned(big_endian(file, 40, 2));
     header.bits = (file[42] & 0x7fu) + 1;
   }
   each_box(file[0] == 0xff ? ImageBytes{} : file, [&](std::string_view kind, ImageBytes payload) {
     if (kind != "jp2h") return;
     each_box(payload, [&](std::string_view inner, ImageBytes p) {
       if (inner == "ihdr" && p.size() >= 11) {
-        bands = static_cast<unsigned>(big_endian(p, 8, 2));
+        bands = unsigned(big_endian(p, 8, 2));
         if (p[10] != 255) header.bits = (p[10] & 0x7fu) + 1;
       }
       if (inner == "bpcc" && !p.empty()) header.bits = (p[0] & 0x7fu) + 1;
       if (inner != "cdef") return;
-      for (std::size_t at = 2; at + 6 <= p.size(); at += 6) {
-        const std::uint64_t type = big_endian(p, at + 2, 2);
+      for (size_t at = 2; at + 6 <= p.size(); at += 6) {
+        const uint64_t type = big_endian(p, at + 2, 2);
         if (type == 1) header.alpha = Alpha::kStraight;
         if (type == 2) header.alpha = Alpha::kAssociated;
       }
@@ -168,12 +164,12 @@ ImageHeader read_webp(ImageBytes file) {
 
 ImageHeader read_gif(ImageBytes file) {
   ImageHeader header{.format = "GIF"};
-  std::size_t at = 13;
-  if (file.size() > 10 && (file[10] & 0x80)) at += std::size_t{3} << ((file[10] & 7) + 1);
+  size_t at = 13;
+  if (file.size() > 10 && (file[10] & 0x80)) at += size_t{3} << ((file[10] & 7) + 1);
   while (at + 4 < file.size() && file[at] == 0x21) {  // extensions before the first picture
     if (file[at + 1] == 0xf9 && (file[at + 3] & 1)) header.alpha = Alpha::kStraight;
     at += 2;
-    while (at < file.size() && file[at] != 0) at += file[at] + std::size_t{1};
+    while (at < file.size() && file[at] != 0) at += file[at] + size_t{1};
     ++at;
   }
   return header;

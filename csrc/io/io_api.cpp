@@ -11,15 +11,8 @@
 #include <iterator>
 #include <memory>
 #include <new>
-#include <span>
-#include <sstream>
-#include <stdexcept>
-#include <string>
-#include <string_view>
 #include <tuple>
-#include <type_traits>
 #include <utility>
-#include <vector>
 
 #include "io/colmap.h"
 #include "io/image_file.h"
@@ -60,13 +53,11 @@ struct blitzgs_io_column {
 
 struct blitzgs_io_reply;
 
-// Runs a function of io_api.cpp. The columns of the reply live until it is freed. Null: no memory for the
-// reply.
+// Runs a function of io_api.cpp. The columns of the reply live until it is freed. Null: no memory.
 BLITZGS_IO_API blitzgs_io_reply* blitzgs_io_call(const char* name, const blitzgs_io_column* arguments,
                                                  size_t count);
 BLITZGS_IO_API int blitzgs_io_status(const blitzgs_io_reply* reply);
 BLITZGS_IO_API const char* blitzgs_io_message(const blitzgs_io_reply* reply);
-// Returns the number of columns.
 BLITZGS_IO_API size_t blitzgs_io_columns(const blitzgs_io_reply* reply, const blitzgs_io_column** columns);
 BLITZGS_IO_API void blitzgs_io_free(blitzgs_io_reply* reply);
 }
@@ -74,55 +65,46 @@ BLITZGS_IO_API void blitzgs_io_free(blitzgs_io_reply* reply);
 namespace {
 
 namespace io = blitzgs::io;
-using Bytes = std::span<const std::uint8_t>;
+using Bytes = std::span<const uint8_t>;
 
-template <class T>
-constexpr std::int32_t type_of() {
-  if constexpr (std::is_same_v<T, std::uint8_t>) return BLITZGS_IO_UINT8;
-  if constexpr (std::is_same_v<T, std::uint32_t>) return BLITZGS_IO_UINT32;
-  if constexpr (std::is_same_v<T, std::int64_t>) return BLITZGS_IO_INT64;
-  if constexpr (std::is_same_v<T, std::uint64_t>) return BLITZGS_IO_UINT64;
+template <class T> constexpr int32_t type_of() {
+  if constexpr (std::is_same_v<T, uint8_t>) return BLITZGS_IO_UINT8;
+  if constexpr (std::is_same_v<T, uint32_t>) return BLITZGS_IO_UINT32;
+  if constexpr (std::is_same_v<T, int64_t>) return BLITZGS_IO_INT64;
+  if constexpr (std::is_same_v<T, uint64_t>) return BLITZGS_IO_UINT64;
   if constexpr (std::is_same_v<T, double>) return BLITZGS_IO_FLOAT64;
 }
 
-// The columns of a call, taken in order.
 class Arguments {
  public:
   explicit Arguments(std::span<const blitzgs_io_column> columns) : columns_(columns) {}
 
-  template <class T>
-  std::span<const T> take() {
+  template <class T> std::span<const T> take() {
     if (next_ == columns_.size()) throw std::logic_error("an argument is missing");
     const blitzgs_io_column& column = columns_[next_++];
     if (column.type != type_of<T>()) throw std::logic_error("an argument has another type");
     return {static_cast<const T*>(column.data), column.size};
   }
-  template <class T = std::uint64_t>
-  T number() {
-    return take<T>()[0];
-  }
+  template <class T = uint64_t> T number() { return take<T>()[0]; }
   std::string text() {
-    const Bytes bytes = take<std::uint8_t>();
+    const Bytes bytes = take<uint8_t>();
     return {bytes.begin(), bytes.end()};
   }
 
  private:
   std::span<const blitzgs_io_column> columns_;
-  std::size_t next_ = 0;
+  size_t next_ = 0;
 };
 
 }  // namespace
 
-// The results own their memory.
 struct blitzgs_io_reply {
   int status = BLITZGS_IO_OK;
   std::string message;
   std::vector<blitzgs_io_column> columns;
   std::vector<std::shared_ptr<const void>> held;
 
-  // A column for each.
-  template <class... T>
-  void add(std::vector<T>&&... values) {
+  template <class... T> void add(std::vector<T>&&... values) {
     const auto add_one = [&]<class V>(std::vector<V>&& one) {
       const auto owner = std::make_shared<const std::vector<V>>(std::move(one));
       columns.push_back({owner->data(), owner->size(), type_of<V>()});
@@ -130,23 +112,19 @@ struct blitzgs_io_reply {
     };
     (add_one(std::move(values)), ...);
   }
-  template <class T = std::uint64_t>
-  void add_number(T value) {
-    add(std::vector<T>{value});
-  }
-  void add_text(std::string_view text) { add(std::vector<std::uint8_t>(text.begin(), text.end())); }
-  template <class Texts>
-  void add_texts(const Texts& texts) {
-    std::vector<std::uint8_t> bytes;
-    std::vector<std::uint64_t> ends;
+  template <class T = uint64_t> void add_number(T value) { add(std::vector<T>{value}); }
+  void add_text(std::string_view text) { add(std::vector<uint8_t>(text.begin(), text.end())); }
+  template <class Texts> void add_texts(const Texts& texts) {
+    std::vector<uint8_t> bytes;
+    std::vector<uint64_t> ends;
     for (const std::string_view text : texts) {
       bytes.insert(bytes.end(), text.begin(), text.end());
       ends.push_back(bytes.size());
     }
     add(std::move(bytes), std::move(ends));
   }
-  std::uint8_t* add_uninitialised(std::size_t size) {
-    const auto owner = std::make_shared_for_overwrite<std::uint8_t[]>(size);
+  uint8_t* add_uninitialised(size_t size) {
+    const auto owner = std::make_shared_for_overwrite<uint8_t[]>(size);
     columns.push_back({owner.get(), size, BLITZGS_IO_UINT8});
     held.push_back(owner);
     return owner.get();
@@ -167,7 +145,7 @@ std::ifstream opened(const std::string& path) {
 
 void camera_models(Arguments&, Reply& reply) {
   std::vector<std::string_view> names, params;
-  std::vector<std::int64_t> ids;
+  std::vector<int64_t> ids;
   for (const io::CameraModel& model : io::camera_models()) {
     ids.push_back(model.id);
     names.push_back(model.name);
@@ -182,9 +160,9 @@ void read_cameras(Arguments& arguments, Reply& reply) {
   const std::string path = arguments.text();
   std::ifstream in = opened(path);
   const auto cameras = is_text(path) ? io::read_cameras_text(in, path) : io::read_cameras_binary(in, path);
-  std::vector<std::uint32_t> ids;
+  std::vector<uint32_t> ids;
   std::vector<std::string_view> models;
-  std::vector<std::uint64_t> widths, heights, ends;
+  std::vector<uint64_t> widths, heights, ends;
   std::vector<double> params;
   for (const io::ColmapCamera& camera : cameras) {
     ids.push_back(camera.id);
@@ -222,13 +200,13 @@ constexpr std::string_view kNumpyTypes[] = {"i1", "u1", "i2", "u2", "i4", "u4", 
 
 void read_ply(Arguments& arguments, Reply& reply) {
   const std::string path = arguments.text();
-  const std::uint64_t first = arguments.number(), most = arguments.number();
+  const uint64_t first = arguments.number(), most = arguments.number();
   std::ifstream in = opened(path);
   io::PlyTable table = io::read_ply(in, path, first, most);
   std::vector<std::string_view> names, types;
   for (const io::PlyProperty& property : table.properties) {
     names.push_back(property.name);
-    types.push_back(kNumpyTypes[static_cast<int>(property.type)]);
+    types.push_back(kNumpyTypes[int(property.type)]);
   }
   reply.add_texts(table.comments);
   reply.add_texts(names);
@@ -245,9 +223,8 @@ std::string as_json(const io::ImageHeader& header) {
   json << std::boolalpha << R"({"format": ")" << header.format << R"(", "supported": )" << header.supported
        << R"(, "width": )" << header.width << R"(, "height": )" << header.height << R"(, "orientation": )"
        << header.orientation << R"(, "bits": )" << header.bits << R"(, "colors": )" << header.colors
-       << R"(, "extras": )" << header.extras << R"(, "samples": ")"
-       << kSamples[static_cast<int>(header.samples)] << R"(", "alpha": ")"
-       << kAlpha[static_cast<int>(header.alpha)] << R"(", "transparent_grey": )"
+       << R"(, "extras": )" << header.extras << R"(, "samples": ")" << kSamples[int(header.samples)]
+       << R"(", "alpha": ")" << kAlpha[int(header.alpha)] << R"(", "transparent_grey": )"
        << (header.transparent_grey ? std::to_string(*header.transparent_grey) : "null")
        << R"(, "is_planar": )" << header.is_planar << R"(, "is_white_zero": )" << header.is_white_zero
        << R"(, "is_lossy": )" << header.is_lossy << "}";
@@ -255,44 +232,43 @@ std::string as_json(const io::ImageHeader& header) {
 }
 
 void read_image_header(Arguments& arguments, Reply& reply) {
-  const Bytes file = arguments.take<std::uint8_t>();
+  const Bytes file = arguments.take<uint8_t>();
   reply.add_text(as_json(io::read_image_header(file, arguments.text())));
 }
 
 void read_image_file(Arguments& arguments, Reply& reply) {
   const std::string path = arguments.text();
-  std::vector<std::uint8_t> bytes = io::read_image_file(path);
+  std::vector<uint8_t> bytes = io::read_image_file(path);
   reply.add_text(as_json(io::read_image_header(bytes, path)));
   reply.add(std::move(bytes));
 }
 
 void tiff_as_stored(Arguments& arguments, Reply& reply) {
-  const Bytes file = arguments.take<std::uint8_t>();
+  const Bytes file = arguments.take<uint8_t>();
   reply.add(io::tiff_as_stored(file, arguments.text()));
 }
 
 void encode_qoi(Arguments& arguments, Reply& reply) {
-  const Bytes rgb = arguments.take<std::uint8_t>();
-  const auto height = static_cast<std::uint32_t>(arguments.number());
-  const auto width = static_cast<std::uint32_t>(arguments.number());
+  const Bytes rgb = arguments.take<uint8_t>();
+  const auto height = uint32_t(arguments.number());
+  const auto width = uint32_t(arguments.number());
   reply.add(io::encode_qoi(rgb.data(), {width, height}));
 }
 
 void decode_qoi(Arguments& arguments, Reply& reply) {
-  const Bytes file = arguments.take<std::uint8_t>();
+  const Bytes file = arguments.take<uint8_t>();
   const io::QoiSize size = io::qoi_size(file);
-  reply.add(std::vector<std::uint64_t>{size.height, size.width});
-  io::decode_qoi(file, reply.add_uninitialised(std::size_t{3} * size.height * size.width));
+  reply.add(std::vector<uint64_t>{size.height, size.width});
+  io::decode_qoi(file, reply.add_uninitialised(size_t{3} * size.height * size.width));
 }
 
-// Flags in memory that several processes share: a process that sees a flag also sees all that was written
-// before the flag was set.
-std::atomic_ref<std::uint8_t> flag_of(Arguments& arguments) {
-  return std::atomic_ref(*const_cast<std::uint8_t*>(arguments.take<std::uint8_t>().data()));
+// Flags in memory that several processes share: a process that sees a flag sees all that was written before.
+std::atomic_ref<uint8_t> flag_of(Arguments& arguments) {
+  return std::atomic_ref(*const_cast<uint8_t*>(arguments.take<uint8_t>().data()));
 }
 void set_flag(Arguments& arguments, Reply&) { flag_of(arguments).store(1, std::memory_order_release); }
 void flag_is_set(Arguments& arguments, Reply& reply) {
-  reply.add_number<std::uint8_t>(flag_of(arguments).load(std::memory_order_acquire));
+  reply.add_number<uint8_t>(flag_of(arguments).load(std::memory_order_acquire));
 }
 
 struct Function {
@@ -309,7 +285,6 @@ constexpr Function kFunctions[] = {
     BLITZGS_IO_FUNCTION(set_flag),          BLITZGS_IO_FUNCTION(flag_is_set),
 };
 
-// Returns the status of a call, and the message of its exception.
 std::pair<int, std::string> run(std::string_view name, Arguments arguments, Reply& reply) {
   try {
     const auto found = std::find_if(std::begin(kFunctions), std::end(kFunctions),
@@ -332,7 +307,7 @@ std::pair<int, std::string> run(std::string_view name, Arguments arguments, Repl
 
 }  // namespace
 
-blitzgs_io_reply* blitzgs_io_call(const char* name, const blitzgs_io_column* arguments, std::size_t count) {
+blitzgs_io_reply* blitzgs_io_call(const char* name, const blitzgs_io_column* arguments, size_t count) {
   try {
     auto reply = std::make_unique<blitzgs_io_reply>();
     std::tie(reply->status, reply->message) = run(name, Arguments({arguments, count}), *reply);
@@ -344,7 +319,7 @@ blitzgs_io_reply* blitzgs_io_call(const char* name, const blitzgs_io_column* arg
 
 int blitzgs_io_status(const blitzgs_io_reply* reply) { return reply->status; }
 const char* blitzgs_io_message(const blitzgs_io_reply* reply) { return reply->message.c_str(); }
-std::size_t blitzgs_io_columns(const blitzgs_io_reply* reply, const blitzgs_io_column** columns) {
+size_t blitzgs_io_columns(const blitzgs_io_reply* reply, const blitzgs_io_column** columns) {
   *columns = reply->columns.data();
   return reply->columns.size();
 }

@@ -1,32 +1,27 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "io/image_file.h"
 
-#include <algorithm>
-#include <array>
 #include <utility>
-#include <vector>
 
 #include "io/jpeg_codes.h"
 
 namespace blitzgs::io {
-
 namespace {
 
-constexpr std::uint8_t kSof0 = 0xc0, kSof2 = 0xc2, kDht = 0xc4, kRst0 = 0xd0, kSoi = 0xd8, kEoi = 0xd9,
-                       kSos = 0xda, kDri = 0xdd;
+constexpr uint8_t kSof0 = 0xc0, kSof2 = 0xc2, kDht = 0xc4, kRst0 = 0xd0, kSoi = 0xd8, kEoi = 0xd9,
+                  kSos = 0xda, kDri = 0xdd;
 
 // If at least this many consecutive zero bytes decode to coefficients, the file is damaged: an encoder writes
 // flat areas as zeros, but never hundreds of equal coefficients. The 8 bytes of look-ahead are included.
 constexpr unsigned kHoleBytes = 64 + 8;
 
 // Limits the memory that a small file can ask for: 8 bytes for each block of all components.
-constexpr std::uint64_t kMaxBlocks = 1 << 24;
+constexpr uint64_t kMaxBlocks = 1 << 24;
 constexpr unsigned kMaxComponents = 4;
 
 // More bytes than these after the last block of a scan are image data.
-constexpr std::size_t kMaxForeignBytes = 4096;
+constexpr size_t kMaxForeignBytes = 4096;
 
-// The check of one file (image_file.h).
 class Checker {
  public:
   Checker(ImageBytes file, const std::string& name) : file_(file), name_(name) {}
@@ -36,7 +31,7 @@ class Checker {
     at_ = 2;
     read_tables(kStandardTables);
     while (true) {
-      const std::uint8_t marker = next_marker();
+      const uint8_t marker = next_marker();
       if (marker == kEoi) {
         if (!scans_) fail("damaged JPEG: it has no image data");
         return;
@@ -57,7 +52,7 @@ class Checker {
     throw FormatError(name_ + ": at byte " + std::to_string(at_), reason);
   }
 
-  std::uint8_t next_marker() {
+  uint8_t next_marker() {
     if (at_ < file_.size() && file_[at_] != 0xff) fail("damaged JPEG: a marker is missing");
     while (at_ < file_.size() && file_[at_] == 0xff) ++at_;
     if (at_ >= file_.size()) fail("truncated JPEG: its end marker is missing");
@@ -66,7 +61,7 @@ class Checker {
 
   ImageBytes next_payload() {
     if (file_.size() - at_ < 2) fail("truncated JPEG: it ends inside a header");
-    const std::size_t length = big_endian(file_, at_, 2);
+    const size_t length = big_endian(file_, at_, 2);
     if (length < 2 || file_.size() - at_ < length) fail("truncated JPEG: it ends inside a header");
     const auto payload = file_.subspan(at_ + 2, length - 2);
     at_ += length;
@@ -84,7 +79,7 @@ class Checker {
     }
   }
 
-  void read_frame(std::uint8_t marker, ImageBytes payload) {
+  void read_frame(uint8_t marker, ImageBytes payload) {
     if (payload.size() < 6 || payload.size() < 6 + 3u * payload[5]) fail("damaged JPEG: its size is cut off");
     walked_ = marker >= kSof0 && marker <= kSof2 && payload[0] == 8;
     progressive_ = marker == kSof2;
@@ -97,7 +92,7 @@ class Checker {
     components_.clear();
     h_max_ = v_max_ = 1;
     for (unsigned k = 0; k < payload[5]; ++k) {
-      const std::uint8_t* p = payload.data() + 6 + 3 * k;
+      const uint8_t* p = payload.data() + 6 + 3 * k;
       Component component{p[0], unsigned{p[1]} >> 4, p[1] & 15u, {}};
       if (component.h < 1 || component.v < 1 || component.h > 4 || component.v > 4) {
         fail("damaged JPEG: impossible sampling factors");
@@ -106,14 +101,13 @@ class Checker {
       v_max_ = std::max(v_max_, component.v);
       components_.push_back(std::move(component));
     }
-    std::uint64_t blocks = 0;
+    uint64_t blocks = 0;
     for (const Component& component : components_) blocks += count_blocks(component);
-    // A height of 0 means that the height follows after the first scan. In such files only the markers are
-    // checked.
+    // A height of 0 means that the height follows after the first scan. There only markers are checked.
     walked_ = walked_ && width_ > 0 && height_ > 0 && blocks <= kMaxBlocks;
   }
 
-  std::uint64_t count_blocks(const Component& component) const {
+  uint64_t count_blocks(const Component& component) const {
     return ceil_div(ceil_div(width_ * component.h, h_max_), 8) *
            ceil_div(ceil_div(height_ * component.v, v_max_), 8);
   }
@@ -126,9 +120,9 @@ class Checker {
     if (!walked_) return skip_entropy_data();
     const Band band = read_band(payload);
     std::vector<Block> blocks;
-    std::uint64_t units = 0;
+    uint64_t units = 0;
     for (unsigned k = 0; k < payload[0]; ++k) {
-      const std::uint8_t id = payload[1 + 2 * k], tables = payload[2 + 2 * k];
+      const uint8_t id = payload[1 + 2 * k], tables = payload[2 + 2 * k];
       const auto found = std::find_if(components_.begin(), components_.end(),
                                       [&](const Component& component) { return component.id == id; });
       if (found == components_.end() || (tables >> 4) > 3 || (tables & 15) > 3) {
@@ -152,8 +146,7 @@ class Checker {
     Component* component;
   };
 
-  // The coefficients of a scan, in zigzag order, and whether it refines coefficients of earlier scans by one
-  // bit.
+  // The coefficients of a scan, in zigzag order, and whether it refines earlier ones by a bit.
   struct Band {
     unsigned first = 0, last = 63;
     bool refines = false;
@@ -161,7 +154,7 @@ class Checker {
 
   Band read_band(ImageBytes payload) {
     if (!progressive_) return {};
-    const std::size_t at = 1 + 2u * payload[0];
+    const size_t at = 1 + 2u * payload[0];
     if (payload.size() < at + 3) fail("damaged JPEG: a scan header is cut off");
     const Band band{payload[at], payload[at + 1], (payload[at + 2] >> 4) != 0};
     const bool is_dc = band.first == 0;
@@ -171,10 +164,10 @@ class Checker {
     return band;
   }
 
-  void read_units(const std::vector<Block>& blocks, std::uint64_t units, const Band& band) {
+  void read_units(const std::vector<Block>& blocks, uint64_t units, const Band& band) {
     unsigned restarts = 0;
     if (band.first > 0) blocks[0].component->nonzero.resize(units);
-    for (std::uint64_t unit = 0; unit < units; ++unit) {
+    for (uint64_t unit = 0; unit < units; ++unit) {
       if (restart_interval_ > 0 && unit > 0 && unit % restart_interval_ == 0) {
         end_of_interval();
         if (next_marker() != kRst0 + restarts++ % 8) fail("damaged JPEG: restart markers are out of order");
@@ -185,7 +178,7 @@ class Checker {
     end_of_interval();
   }
 
-  void read_unit(const std::vector<Block>& blocks, const Band& band, std::uint64_t unit) {
+  void read_unit(const std::vector<Block>& blocks, const Band& band, uint64_t unit) {
     for (const Block& block : blocks) {
       if (!progressive_) {
         read_block(block);
@@ -206,11 +199,11 @@ class Checker {
   void skip_foreign_bytes(const std::vector<Block>& blocks, const Band& band) {
     const unsigned fill = (held_ - padding_) % 8;
     if (end_run_ > 0 || (fill > 0 && bits_ >> (64 - fill) != (1u << fill) - 1)) return;
-    std::size_t end = at_;
+    size_t end = at_;
     while (end + 1 < file_.size() && (file_[end] != 0xff || file_[end + 1] == 0)) ++end;
-    const std::size_t begin = at_ - std::min(at_, std::size_t{(held_ - padding_) / 8});
+    const size_t begin = at_ - std::min(at_, size_t{(held_ - padding_) / 8});
     const bool is_scan_end = end + 1 < file_.size() && (file_[end + 1] < kRst0 || file_[end + 1] >= kSoi);
-    const std::size_t foreign = end - begin;
+    const size_t foreign = end - begin;
     if (!is_scan_end || foreign == 0 || foreign > kMaxForeignBytes || are_blocks(blocks, band)) return;
     at_ = end;
     held_ = padding_ = 0;
@@ -228,7 +221,7 @@ class Checker {
     std::vector<Block> copies = blocks;
     for (Block& block : copies) block.component = &any;
     try {
-      for (std::size_t unit = 0; unit < 8 * kMaxForeignBytes; ++unit) {
+      for (size_t unit = 0; unit < 8 * kMaxForeignBytes; ++unit) {
         rest.refill();
         const unsigned left = rest.held_ - rest.padding_;
         if (left < 8 && (left == 0 || rest.bits_ >> (64 - left) == (1u << left) - 1)) return unit > 0;
@@ -240,19 +233,19 @@ class Checker {
   }
 
   // Reads one block in the first scan of a band.
-  void read_band(const CodeTable& table, const Band& band, std::uint64_t& nonzero) {
+  void read_band(const CodeTable& table, const Band& band, uint64_t& nonzero) {
     if (end_run_ > 0) {
       --end_run_;
       return;
     }
     for (unsigned k = band.first; k <= band.last; ++k) {
-      const std::uint8_t symbol = next_symbol(table);
+      const uint8_t symbol = next_symbol(table);
       const unsigned size = symbol & 15u, run = symbol >> 4;
       k += size == 0 && run < 15 ? 0 : run;
       if (size > 0) {
         if (k > band.last) fail("damaged JPEG: a block has too many coefficients");
         check_hole();
-        nonzero |= std::uint64_t{1} << k;
+        nonzero |= uint64_t{1} << k;
         take(size);
       } else if (run < 15) {
         end_run_ = (1u << run) + take(run) - 1;
@@ -263,10 +256,10 @@ class Checker {
 
   // Reads one block in a refining scan of a band: one more bit for each coefficient that is not zero, and the
   // coefficients that become nonzero.
-  void refine_band(const CodeTable& table, const Band& band, std::uint64_t& nonzero) {
+  void refine_band(const CodeTable& table, const Band& band, uint64_t& nonzero) {
     unsigned k = band.first;
     for (; end_run_ == 0 && k <= band.last; ++k) {
-      const std::uint8_t symbol = next_symbol(table);
+      const uint8_t symbol = next_symbol(table);
       const unsigned size = symbol & 15u;
       unsigned run = symbol >> 4;
       if (size == 0 && run < 15) {
@@ -283,7 +276,7 @@ class Checker {
       }
       if (size == 0) continue;
       if (k > band.last) fail("damaged JPEG: a block has too many coefficients");
-      nonzero |= std::uint64_t{1} << k;
+      nonzero |= uint64_t{1} << k;
     }
     if (end_run_ == 0) return;
     for (; k <= band.last; ++k) {
@@ -292,11 +285,10 @@ class Checker {
     --end_run_;
   }
 
-  // Reads one block of a sequential file.
   void read_block(const Block& block) {
     take(next_symbol(*block.dc) & 15u);
     for (unsigned k = 1; k < 64; ++k) {
-      const std::uint8_t symbol = next_symbol(*block.ac);
+      const uint8_t symbol = next_symbol(*block.ac);
       const unsigned size = symbol & 15u, run = symbol >> 4;
       if (size == 0 && run != 15) return;
       k += run;
@@ -313,7 +305,7 @@ class Checker {
   // Makes at least 16 bits available. Bits after a marker are padding, which no code may use.
   void refill() {
     while (held_ <= 48) {
-      std::uint64_t byte = 0;
+      uint64_t byte = 0;
       if (at_ < file_.size() && (file_[at_] != 0xff || (at_ + 1 < file_.size() && file_[at_ + 1] == 0))) {
         byte = file_[at_];
         at_ += byte == 0xff ? 2 : 1;
@@ -326,19 +318,18 @@ class Checker {
     }
   }
 
-  // Returns the next n bits, at most 16, as a number.
   unsigned take(unsigned n) {
     if (held_ < 16) refill();
-    const unsigned value = n > 0 ? static_cast<unsigned>(bits_ >> (64 - n)) : 0;
+    const unsigned value = n > 0 ? unsigned(bits_ >> (64 - n)) : 0;
     bits_ <<= n;
     held_ -= n;
     if (held_ < padding_) fail("truncated or damaged JPEG: image data end before the last block");
     return value;
   }
 
-  std::uint8_t next_symbol(const CodeTable& table) {
+  uint8_t next_symbol(const CodeTable& table) {
     if (held_ < 16) refill();
-    const Code code = table.find(static_cast<std::uint32_t>(bits_ >> 48));
+    const Code code = table.find(uint32_t(bits_ >> 48));
     if (code.length == 0) fail("damaged JPEG: no such Huffman code");
     take(code.length);
     return code.symbol;
@@ -352,7 +343,7 @@ class Checker {
     for (left -= left % 8; left > 0; left -= 8, bits_ <<= 8) {
       if (bits_ >> 56) fail("damaged JPEG: image data go on after the last block");
     }
-    const std::size_t end = at_;
+    const size_t end = at_;
     while (at_ < file_.size() && file_[at_] == 0) ++at_;
     if (progressive_ && at_ - end > kMaxForeignBytes) fail("damaged JPEG: a hole of zeros");
     if (at_ + 1 < file_.size() && (file_[at_] != 0xff || file_[at_ + 1] == 0)) {
@@ -365,7 +356,7 @@ class Checker {
 
   void skip_entropy_data() {
     while (at_ + 1 < file_.size()) {
-      const std::uint8_t next = file_[at_ + 1];
+      const uint8_t next = file_[at_ + 1];
       if (file_[at_] == 0xff && next != 0 && next != 0xff && !(next >= kRst0 && next < kRst0 + 8)) return;
       ++at_;
     }
@@ -374,20 +365,20 @@ class Checker {
 
   ImageBytes file_;
   const std::string& name_;
-  std::size_t at_ = 0;
+  size_t at_ = 0;
   std::array<std::array<CodeTable, 4>, 2> tables_;
   std::vector<Component> components_;
-  std::uint64_t width_ = 0, height_ = 0;
+  uint64_t width_ = 0, height_ = 0;
   unsigned h_max_ = 1, v_max_ = 1;
   unsigned restart_interval_ = 0;
   bool walked_ = false;  // whether the check reads every code of the image data
   bool progressive_ = false;
   unsigned scans_ = 0;
-  std::uint64_t bits_ = 0;  // the next bits, highest first
-  unsigned held_ = 0;       // the number of bits in `bits_`, padding included
-  unsigned padding_ = 0;    // the number of these bits, at their end, that are padding
-  unsigned zeros_ = 0;      // the number of consecutive zero bytes that were read last
-  unsigned end_run_ = 0;    // the number of further blocks of a progressive scan without new coefficients
+  uint64_t bits_ = 0;     // the next bits, highest first
+  unsigned held_ = 0;     // the number of bits in `bits_`, padding included
+  unsigned padding_ = 0;  // the number of these bits, at their end, that are padding
+  unsigned zeros_ = 0;    // the number of consecutive zero bytes that were read last
+  unsigned end_run_ = 0;  // the number of further blocks of a progressive scan without new coefficients
 };
 
 }  // namespace

@@ -11,7 +11,7 @@ namespace blitzgs::io {
 
 // The Huffman tables that decoders use where a file has none (T.81, K.3), as the payload of a DHT segment.
 // Frames of Motion JPEG, as webcams write them, leave them out.
-inline constexpr std::uint8_t kStandardTables[] = {
+inline constexpr uint8_t kStandardTables[] = {
     0x00, 0x00, 0x01, 0x05, 0x01, 0x01, 0x01, 0x01, 0x01, 0x01, 0x00, 0x00, 0x00, 0x00, 0x00, 0x00, 0x00,
     0x00, 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x09, 0x0a, 0x0b, 0x10, 0x00, 0x02, 0x01, 0x03,
     0x03, 0x02, 0x04, 0x03, 0x05, 0x05, 0x04, 0x04, 0x00, 0x00, 0x01, 0x7d, 0x01, 0x02, 0x03, 0x00, 0x04,
@@ -40,8 +40,8 @@ inline constexpr std::uint8_t kStandardTables[] = {
 };
 
 struct Code {
-  std::uint8_t length = 0;  // in bits; 0: no such code
-  std::uint8_t symbol = 0;
+  uint8_t length = 0;  // in bits; 0: no such code
+  uint8_t symbol = 0;
 };
 
 // Huffman codes of 1 to 16 bits. Codes of up to kShort bits are looked up by the next kShort bits of the
@@ -51,25 +51,25 @@ struct CodeTable {
   static constexpr unsigned kShort = 9;
 
   std::array<Code, 1 << kShort> short_codes{};
-  std::array<std::uint32_t, 17> ends{};  // by length: the first 16-bit number beyond the codes of this length
-  std::array<int, 17> bases{};           // by length: the index of its first symbol minus its first code
-  std::vector<std::uint8_t> symbols;     // empty: there is no such table
+  std::array<uint32_t, 17> ends{};  // by length: the first 16-bit number beyond the codes of this length
+  std::array<int, 17> bases{};      // by length: the index of its first symbol minus its first code
+  std::vector<uint8_t> symbols;     // empty: there is no such table
 
   // Builds the table from the beginning of a DHT payload of at least 17 bytes; false: there is no such table.
-  bool build(std::span<const std::uint8_t> payload) {
+  bool build(std::span<const uint8_t> payload) {
     *this = CodeTable{};
-    std::uint32_t begin = 0;
+    uint32_t begin = 0;
     for (unsigned length = 1; length <= 16; ++length) {
-      const std::uint32_t count = payload[length], step = 1u << (16 - length);
-      const std::size_t first = symbols.size();
+      const uint32_t count = payload[length], step = 1u << (16 - length);
+      const size_t first = symbols.size();
       if (payload.size() - 17 < first + count || begin + count * step > (1u << 16)) return false;
-      bases[length] = static_cast<int>(first) - static_cast<int>(begin / step);
+      bases[length] = int(first) - int(begin / step);
       const auto added = payload.subspan(17 + first, count);
       symbols.insert(symbols.end(), added.begin(), added.end());
-      for (std::uint32_t k = 0; length <= kShort && k < count; ++k) {
+      for (uint32_t k = 0; length <= kShort && k < count; ++k) {
         const unsigned shift = 16 - kShort;
         std::fill_n(short_codes.begin() + ((begin + k * step) >> shift), step >> shift,
-                    Code{static_cast<std::uint8_t>(length), added[k]});
+                    Code{uint8_t(length), added[k]});
       }
       begin += count * step;
       ends[length] = begin;
@@ -77,13 +77,13 @@ struct CodeTable {
     return true;
   }
 
-  Code find(std::uint32_t bits16) const {
+  Code find(uint32_t bits16) const {
     const Code found = short_codes[bits16 >> (16 - kShort)];
     if (found.length > 0) return found;
     for (unsigned length = kShort + 1; length <= 16; ++length) {
       if (bits16 < ends[length]) {
-        const int code = static_cast<int>(bits16 >> (16 - length));
-        return {static_cast<std::uint8_t>(length), symbols[static_cast<std::size_t>(bases[length] + code)]};
+        const int code = int(bits16 >> (16 - length));
+        return {uint8_t(length), symbols[size_t(bases[length] + code)]};
       }
     }
     return {};
@@ -91,12 +91,12 @@ struct CodeTable {
 };
 
 struct Component {
-  std::uint8_t id;
+  uint8_t id;
   unsigned h, v;
   // For each block of a progressive file, the coefficients that are not zero so far, as bits in zigzag order.
-  std::vector<std::uint64_t> nonzero;
+  std::vector<uint64_t> nonzero;
 };
 
-inline std::uint64_t ceil_div(std::uint64_t a, std::uint64_t b) { return (a + b - 1) / b; }
+inline uint64_t ceil_div(uint64_t a, uint64_t b) { return (a + b - 1) / b; }
 
 }  // namespace blitzgs::io

@@ -2,16 +2,12 @@
 #include "io/ply.h"
 
 #include <algorithm>
-#include <charconv>
 #include <iterator>
 #include <optional>
-#include <sstream>
-#include <string>
 
 #include "io/byte_reader.h"
 
 namespace blitzgs::io {
-
 namespace {
 
 std::string read_token(ByteReader& reader) {
@@ -30,8 +26,7 @@ std::string read_token(ByteReader& reader) {
   return token;
 }
 
-template <class T>
-void parse_value(ByteReader& reader, std::uint8_t* out) {
+template <class T> void parse_value(ByteReader& reader, uint8_t* out) {
   const std::string token = read_token(reader);
   T value{};
   if (!parse_number(token, value)) reader.fail("'" + token.substr(0, 40) + "' is not a valid value");
@@ -41,35 +36,35 @@ void parse_value(ByteReader& reader, std::uint8_t* out) {
 struct TypeInfo {
   std::string_view name, alias;
   int bytes;
-  void (*parse)(ByteReader&, std::uint8_t* out);  // a value in text
+  void (*parse)(ByteReader&, uint8_t* out);  // a value in text
 };
 // In the order of PlyType.
 constexpr TypeInfo kTypes[] = {
-    {"char", "int8", 1, parse_value<std::int8_t>},    {"uchar", "uint8", 1, parse_value<std::uint8_t>},
-    {"short", "int16", 2, parse_value<std::int16_t>}, {"ushort", "uint16", 2, parse_value<std::uint16_t>},
-    {"int", "int32", 4, parse_value<std::int32_t>},   {"uint", "uint32", 4, parse_value<std::uint32_t>},
-    {"float", "float32", 4, parse_value<float>},      {"double", "float64", 8, parse_value<double>}};
-const TypeInfo& info_of(PlyType type) { return kTypes[static_cast<std::size_t>(type)]; }
+    {"char", "int8", 1, parse_value<int8_t>},    {"uchar", "uint8", 1, parse_value<uint8_t>},
+    {"short", "int16", 2, parse_value<int16_t>}, {"ushort", "uint16", 2, parse_value<uint16_t>},
+    {"int", "int32", 4, parse_value<int32_t>},   {"uint", "uint32", 4, parse_value<uint32_t>},
+    {"float", "float32", 4, parse_value<float>}, {"double", "float64", 8, parse_value<double>}};
+const TypeInfo& info_of(PlyType type) { return kTypes[size_t(type)]; }
 
 std::optional<PlyType> find_type(std::string_view name) {
-  for (std::size_t i = 0; i < std::size(kTypes); ++i) {
+  for (size_t i = 0; i < std::size(kTypes); ++i) {
     if (name == kTypes[i].name || name == kTypes[i].alias) return static_cast<PlyType>(i);
   }
   return std::nullopt;
 }
 
-constexpr std::size_t kMaxLine = 1 << 16;
-constexpr std::size_t kMaxProperties = 1 << 12;
+constexpr size_t kMaxLine = 1 << 16;
+constexpr size_t kMaxProperties = 1 << 12;
 
 enum class Encoding { kAscii, kLittle, kBig };
 
 struct Element {
   std::string name;
-  std::uint64_t count = 0;
+  uint64_t count = 0;
   std::vector<PlyProperty> properties;
   bool has_list = false;
 
-  std::uint64_t row_bytes() const { return io::row_bytes(properties); }
+  uint64_t row_bytes() const { return io::row_bytes(properties); }
 };
 
 std::string read_line(ByteReader& reader) {
@@ -163,8 +158,8 @@ Header read_header(ByteReader& reader) {
 void skip_element(ByteReader& reader, const Element& element, Encoding encoding) {
   if (element.has_list) reader.fail("element " + element.name + " has lists and comes before the vertices");
   if (encoding == Encoding::kAscii) {
-    for (std::uint64_t i = 0; i < element.count && !element.properties.empty(); ++i) {
-      for (std::size_t k = 0; k < element.properties.size(); ++k) read_token(reader);
+    for (uint64_t i = 0; i < element.count && !element.properties.empty(); ++i) {
+      for (size_t k = 0; k < element.properties.size(); ++k) read_token(reader);
     }
   } else if (element.row_bytes() > 0) {
     reader.check_count(element.count, element.row_bytes(), "rows before the vertices");
@@ -172,7 +167,7 @@ void skip_element(ByteReader& reader, const Element& element, Encoding encoding)
   }
 }
 
-void swap_bytes(const Element& vertex, std::vector<std::uint8_t>& rows) {
+void swap_bytes(const Element& vertex, std::vector<uint8_t>& rows) {
   for (auto at = rows.begin(); at != rows.end();) {
     for (const PlyProperty& property : vertex.properties) {
       std::reverse(at, at + property.bytes());
@@ -185,13 +180,13 @@ void swap_bytes(const Element& vertex, std::vector<std::uint8_t>& rows) {
 
 int PlyProperty::bytes() const { return info_of(type).bytes; }
 
-std::uint64_t row_bytes(const std::vector<PlyProperty>& properties) {
-  std::uint64_t bytes = 0;
+uint64_t row_bytes(const std::vector<PlyProperty>& properties) {
+  uint64_t bytes = 0;
   for (const PlyProperty& property : properties) bytes += property.bytes();
   return bytes;
 }
 
-PlyTable read_ply(std::istream& in, const std::string& name, std::uint64_t first, std::uint64_t most) {
+PlyTable read_ply(std::istream& in, const std::string& name, uint64_t first, uint64_t most) {
   ByteReader reader(in, name);
   Header header = read_header(reader);
   const auto vertex = std::find_if(header.elements.begin(), header.elements.end(),
@@ -204,7 +199,7 @@ PlyTable read_ply(std::istream& in, const std::string& name, std::uint64_t first
   }
   // In text a value takes at least a digit and a separator; the last one needs no separator.
   const bool ascii = header.encoding == Encoding::kAscii;
-  const std::uint64_t min_bytes = ascii ? 2 * vertex->properties.size() - 1 : vertex->row_bytes();
+  const uint64_t min_bytes = ascii ? 2 * vertex->properties.size() - 1 : vertex->row_bytes();
   reader.check_count(vertex->count, min_bytes, "vertices");
   first = std::min(first, vertex->count);
   PlyTable table{std::move(header.comments),
@@ -214,9 +209,9 @@ PlyTable read_ply(std::istream& in, const std::string& name, std::uint64_t first
                  vertex->count};
   table.rows.resize(table.count * vertex->row_bytes());
   if (ascii) {
-    for (std::uint64_t i = 0; i < first * table.properties.size(); ++i) read_token(reader);
-    std::uint8_t* out = table.rows.data();
-    for (std::uint64_t i = 0; i < table.count; ++i) {
+    for (uint64_t i = 0; i < first * table.properties.size(); ++i) read_token(reader);
+    uint8_t* out = table.rows.data();
+    for (uint64_t i = 0; i < table.count; ++i) {
       for (const PlyProperty& property : table.properties) {
         info_of(property.type).parse(reader, out);
         out += property.bytes();

@@ -4,18 +4,13 @@
 // Reads ASCII and binary of either byte order. Elements after the vertices are not read; list properties of
 // the vertices are refused. Rows are packed in header order without padding.
 #pragma once
-#include <cstdint>
 #include <iosfwd>
-#include <limits>
-#include <string>
-#include <string_view>
-#include <vector>
 
 #include "io/byte_reader.h"
 
 namespace blitzgs::io {
 
-enum class PlyType : std::uint8_t { kInt8, kUint8, kInt16, kUint16, kInt32, kUint32, kFloat32, kFloat64 };
+enum class PlyType : uint8_t { kInt8, kUint8, kInt16, kUint16, kInt32, kUint32, kFloat32, kFloat64 };
 
 struct PlyProperty {
   std::string name;
@@ -23,18 +18,18 @@ struct PlyProperty {
 
   int bytes() const;
 };
-std::uint64_t row_bytes(const std::vector<PlyProperty>& properties);
+uint64_t row_bytes(const std::vector<PlyProperty>& properties);
 
 struct PlyTable {
   std::vector<std::string> comments;  // whole header lines: "comment ..." and "obj_info ..."
   std::vector<PlyProperty> properties;
-  std::uint64_t count = 0;
-  std::vector<std::uint8_t> rows;  // count x row_bytes
-  std::uint64_t total = 0;         // rows of the file, of which `rows` may hold some
+  uint64_t count = 0;
+  std::vector<uint8_t> rows;  // count x row_bytes
+  uint64_t total = 0;         // rows of the file, of which `rows` may hold some
 };
 
 // Reads `most` rows from row `first` on, or as many as there are. Throws FormatError with the file, byte
 // offset or header line, and reason.
-PlyTable read_ply(std::istream& in, const std::string& name, std::uint64_t first = 0,
-                  std::uint64_t most = std::numeric_limits<std::uint64_t>::max());
+PlyTable read_ply(std::istream& in, const std::string& name, uint64_t first = 0,
+                  uint64_t most = std::numeric_limits<uint64_t>::max());
 }  // namespace blitzgs::io

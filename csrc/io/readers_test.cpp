@@ -3,8 +3,6 @@
 #include <cmath>
 #include <functional>
 #include <optional>
-#include <sstream>
-#include <type_traits>
 
 #include "common/catch.h"
 #include "io/byte_reader.h"
@@ -18,8 +16,7 @@ namespace {
 
 using Reader = std::function<void(std::istream&)>;
 // The bytes of values, one after the other; a text ends with a NUL.
-template <class... T>
-std::string bytes_of(const T&... values) {
+template <class... T> std::string bytes_of(const T&... values) {
   std::string out;
   const auto add = [&]<class V>(const V& value) {
     if constexpr (std::is_convertible_v<V, std::string>) {
@@ -32,9 +29,9 @@ std::string bytes_of(const T&... values) {
   return out;
 }
 
-using u32 = std::uint32_t;
-using u64 = std::uint64_t;
-using i64 = std::int64_t;
+using u32 = uint32_t;
+using u64 = uint64_t;
+using i64 = int64_t;
 
 const std::string kCameras = bytes_of(u64{2}, u32{5}, 1, u64{640}, u64{480}, 500.0, 510.0, 320.0, 240.0) +
                              bytes_of(u32{6}, 3, u64{64}, u64{48}, 50.0, 32.0, 24.0, 1e-17, -0.1);
@@ -42,10 +39,10 @@ const std::string kImages =
     bytes_of(u64{2}, u32{3}, 1.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0, u32{5}, "a.jpg", u64{2}, 1.5, 2.5, i64{-1},
              -3.0, 4.0, i64{7}) +
     bytes_of(u32{9}, 0.5, -0.5, 0.5, 0.5, -4.0, 5e-300, 6.0, u32{6}, "b/c.png", u64{0});
-const std::string kPoints = bytes_of(u64{2}, i64{7}, 0.0, 1.0, 2.0, std::array<std::uint8_t, 3>{255, 0, 1},
-                                     0.25, u64{1}, u32{3}, u32{1}) +
-                            bytes_of(i64{8}, 3.0, 4.0, 5.0, std::array<std::uint8_t, 3>{2, 3, 4}, -1.0,
-                                     u64{2}, u32{3}, u32{0}, u32{9}, u32{0});
+const std::string kPoints =
+    bytes_of(u64{2}, i64{7}, 0.0, 1.0, 2.0, std::array<uint8_t, 3>{255, 0, 1}, 0.25, u64{1}, u32{3}, u32{1}) +
+    bytes_of(i64{8}, 3.0, 4.0, 5.0, std::array<uint8_t, 3>{2, 3, 4}, -1.0, u64{2}, u32{3}, u32{0}, u32{9},
+             u32{0});
 const std::string kCamerasText = "5 PINHOLE 640 480 500 510 320 240\n6 RADIAL 64 48 50 32 24 1e-17 -0.1\n";
 const std::string kImagesText =
     "3 1 0 0 0 1 2 3 5 a.jpg\n1.5 2.5 -1 -3 4 7\n9 0.5 -0.5 0.5 0.5 -4 5e-300 6 6 b/c.png\n\n";
@@ -89,20 +86,20 @@ TEST_CASE("every truncation of a binary COLMAP file is refused") {
     INFO(format.name);
     const std::string& bytes = format.bytes;
     REQUIRE_FALSE(refused(format, bytes));
-    for (std::size_t n = 0; n < bytes.size(); ++n) REQUIRE(refused(format, bytes.substr(0, n)));
+    for (size_t n = 0; n < bytes.size(); ++n) REQUIRE(refused(format, bytes.substr(0, n)));
     REQUIRE(refused(format, bytes + '\0'));
   }
 }
 
 TEST_CASE("COLMAP files with wrong bytes are read or refused, never worse") {
-  std::uint32_t state = 1;
+  uint32_t state = 1;
   for (const Format& format : formats()) {
     INFO(format.name);
     int refusals = 0;
     for (int round = 0; round < 2000; ++round) {
       std::string damaged = format.bytes;
       for (int k = 0; k <= round % 4; ++k) {
-        damaged[next_random(state) % damaged.size()] = static_cast<char>(next_random(state));
+        damaged[next_random(state) % damaged.size()] = char(next_random(state));
       }
       refusals += refused(format, damaged);
     }
@@ -137,8 +134,7 @@ TEST_CASE("an image in the place of observations is refused, whether these are r
 
 namespace {
 
-template <class T>
-std::optional<T> parsed(std::string_view text) {
+template <class T> std::optional<T> parsed(std::string_view text) {
   T value{};
   return parse_number(text, value) ? std::optional<T>(value) : std::nullopt;
 }
@@ -148,8 +144,8 @@ std::optional<T> parsed(std::string_view text) {
 TEST_CASE("numbers may have a sign and end where their text ends") {
   REQUIRE(parsed<double>("+1.5e3") == 1500.0);
   REQUIRE(parsed<double>("-.5") == -0.5);
-  REQUIRE(parsed<std::uint8_t>("+255") == 255);
-  REQUIRE(parsed<std::int32_t>("-7") == -7);
+  REQUIRE(parsed<uint8_t>("+255") == 255);
+  REQUIRE(parsed<int32_t>("-7") == -7);
   for (const char* text : {"", "+", "-", "+-1", "++1", " 1", "1 ", "1x", "0x1p3", "1e400x", "1,5"}) {
     CAPTURE(text);
     REQUIRE_FALSE(parsed<double>(text));
@@ -170,8 +166,8 @@ TEST_CASE("real numbers beyond the range are zero or infinity with their sign, i
     REQUIRE(parsed<double>("+" + text) == std::numeric_limits<double>::infinity());
     REQUIRE(parsed<double>("-" + text) == -std::numeric_limits<double>::infinity());
   }
-  REQUIRE_FALSE(parsed<std::uint8_t>("256"));
-  REQUIRE_FALSE(parsed<std::int64_t>("9223372036854775808"));
+  REQUIRE_FALSE(parsed<uint8_t>("256"));
+  REQUIRE_FALSE(parsed<int64_t>("9223372036854775808"));
 }
 
 // PLY
@@ -198,7 +194,7 @@ TEST_CASE("ASCII PLY may have signs, and numbers that its types do not hold") {
   const std::string file =
       "ply\nformat ascii 1.0\nelement vertex 1\nproperty float a\nproperty double b\nproperty uchar c\n"
       "end_header\n1e-46 -1e-400 ";
-  REQUIRE(parsed(file + "+7").rows == std::vector<std::uint8_t>{0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0x80, 7});
+  REQUIRE(parsed(file + "+7").rows == std::vector<uint8_t>{0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0x80, 7});
   REQUIRE(refused(file));
 }
 
@@ -207,7 +203,7 @@ TEST_CASE("elements around the vertices are passed over") {
       "ply\nformat ascii 1.0\nelement camera 2\nproperty float f\nelement vertex 1\nproperty int x\n"
       "element face 1\nproperty list uchar int vertex_indices\nend_header\n";
   const PlyTable table = parsed(header + "1.5\n2.5\n7\n3 0 0 0\n");
-  REQUIRE(table.rows == std::vector<std::uint8_t>{7, 0, 0, 0});
+  REQUIRE(table.rows == std::vector<uint8_t>{7, 0, 0, 0});
 }
 
 TEST_CASE("some rows are those rows of all") {
@@ -215,26 +211,26 @@ TEST_CASE("some rows are those rows of all") {
   const std::string ascii = "ply\nformat ascii 1.0\n" + header + "1 2\n3 4\n5 6\n7 8\n";
   const std::string binary = "ply\nformat binary_big_endian 1.0\n" + header + "\1\2\3\4\5\6\7\10";
   for (const std::string& bytes : {ascii, binary}) {
-    const auto rows = [&](std::uint64_t first, std::uint64_t most) {
+    const auto rows = [&](uint64_t first, uint64_t most) {
       std::istringstream in(bytes);
       const PlyTable table = read_ply(in, "f", first, most);
       REQUIRE((table.total == 4 && table.rows.size() == 2 * table.count));
       return table.rows;
     };
-    REQUIRE(rows(1, 2) == std::vector<std::uint8_t>{3, 4, 5, 6});
-    REQUIRE(rows(3, 9) == std::vector<std::uint8_t>{7, 8});
+    REQUIRE(rows(1, 2) == std::vector<uint8_t>{3, 4, 5, 6});
+    REQUIRE(rows(3, 9) == std::vector<uint8_t>{7, 8});
     REQUIRE((rows(0, 0).empty() && rows(99, 1).empty()));
   }
 }
 
 TEST_CASE("every truncation of a PLY file is refused, and wrong bytes are never worse") {
   const std::string& bytes = kTable;
-  for (std::size_t n = 0; n < bytes.size(); ++n) REQUIRE(refused(bytes.substr(0, n)));
+  for (size_t n = 0; n < bytes.size(); ++n) REQUIRE(refused(bytes.substr(0, n)));
   int refusals = 0;
-  for (std::size_t at = 0; at < bytes.size(); ++at) {
+  for (size_t at = 0; at < bytes.size(); ++at) {
     for (const int value : {0, 10, 32, 57, 128, 255}) {
       std::string damaged = bytes;
-      damaged[at] = static_cast<char>(value);
+      damaged[at] = char(value);
       refusals += refused(damaged);
     }
   }

@@ -5,7 +5,6 @@
 #include "io/image_file.h"
 
 namespace blitzgs::io {
-
 namespace {
 
 constexpr unsigned kNewSubfileType = 254, kWidth = 256, kHeight = 257, kBits = 258, kCompression = 259,
@@ -17,8 +16,8 @@ constexpr unsigned kMaxEntries = 4096;
 
 struct Entry {
   unsigned tag = 0, type = 0;
-  std::uint64_t count = 0;
-  std::size_t at = 0;  // of the values, in the file
+  uint64_t count = 0;
+  size_t at = 0;  // of the values, in the file
 };
 
 // The first directory. A directory that is cut off has the entries before the cut, as `complete` says.
@@ -29,19 +28,19 @@ class Directory {
     big_ = file.size() > 3 && number(2, 2) == 43;
     const unsigned word = big_ ? 8 : 4, header = big_ ? 8 : 4;
     if (!has(header, word)) return;
-    const std::uint64_t start = number(header, word);
+    const uint64_t start = number(header, word);
     const unsigned count_bytes = big_ ? 8 : 2, entry_bytes = big_ ? 20 : 12;
     if (!has(start, count_bytes)) return;
-    const std::uint64_t count = number(start, count_bytes);
+    const uint64_t count = number(start, count_bytes);
     if (count > kMaxEntries) return;
-    for (std::uint64_t k = 0; k < count; ++k) {
-      const std::uint64_t at = start + count_bytes + k * entry_bytes;
+    for (uint64_t k = 0; k < count; ++k) {
+      const uint64_t at = start + count_bytes + k * entry_bytes;
       if (!has(at, entry_bytes)) return;
-      Entry entry{static_cast<unsigned>(number(at, 2)), static_cast<unsigned>(number(at + 2, 2)),
-                  number(at + 4, word), static_cast<std::size_t>(at + 4 + word)};
-      const std::uint64_t bytes = value_bytes(entry.type);
+      Entry entry{unsigned(number(at, 2)), unsigned(number(at + 2, 2)), number(at + 4, word),
+                  size_t(at + 4 + word)};
+      const uint64_t bytes = value_bytes(entry.type);
       if (bytes == 0 || entry.count > file.size()) continue;
-      if (entry.count * bytes > word) entry.at = static_cast<std::size_t>(number(entry.at, word));
+      if (entry.count * bytes > word) entry.at = size_t(number(entry.at, word));
       if (has(entry.at, entry.count * bytes)) entries_.push_back(entry);
     }
     complete_ = true;
@@ -55,37 +54,33 @@ class Directory {
     return found == entries_.end() || found->count == 0 ? nullptr : &*found;
   }
 
-  std::uint64_t value(unsigned tag, std::uint64_t fallback, std::uint64_t index = 0) const {
+  uint64_t value(unsigned tag, uint64_t fallback, uint64_t index = 0) const {
     const Entry* entry = find(tag);
     if (!entry || index >= entry->count) return fallback;
     const unsigned bytes = value_bytes(entry->type);
     return number(entry->at + index * bytes, bytes);
   }
 
-  void write(std::vector<std::uint8_t>& file, unsigned tag, std::uint8_t value) const {
+  void write(std::vector<uint8_t>& file, unsigned tag, uint8_t value) const {
     const Entry* entry = find(tag);
     if (!entry) return;
     const unsigned bytes = value_bytes(entry->type);
-    std::fill_n(file.begin() + static_cast<std::ptrdiff_t>(entry->at), bytes, std::uint8_t{0});
+    std::fill_n(file.begin() + ptrdiff_t(entry->at), bytes, uint8_t{0});
     file[entry->at + (little_ ? 0 : bytes - 1)] = value;
   }
 
  private:
   // Of the types of whole numbers; 0: another type.
   static unsigned value_bytes(unsigned type) {
-    constexpr std::uint8_t kBytes[] = {0, 1, 0, 2, 4, 0, 1, 0, 2, 4, 0, 0, 0, 4, 0, 0, 8, 0, 8};
+    constexpr uint8_t kBytes[] = {0, 1, 0, 2, 4, 0, 1, 0, 2, 4, 0, 0, 0, 4, 0, 0, 8, 0, 8};
     return type < std::size(kBytes) ? kBytes[type] : 0;
   }
 
-  bool has(std::uint64_t at, std::uint64_t bytes) const {
-    return at <= file_.size() && bytes <= file_.size() - at;
-  }
+  bool has(uint64_t at, uint64_t bytes) const { return at <= file_.size() && bytes <= file_.size() - at; }
 
-  std::uint64_t number(std::uint64_t at, unsigned bytes) const {
-    std::uint64_t value = 0;
-    for (unsigned k = 0; k < bytes; ++k) {
-      value = value << 8 | file_[at + (little_ ? bytes - 1 - k : k)];
-    }
+  uint64_t number(uint64_t at, unsigned bytes) const {
+    uint64_t value = 0;
+    for (unsigned k = 0; k < bytes; ++k) value = value << 8 | file_[at + (little_ ? bytes - 1 - k : k)];
     return value;
   }
 
@@ -110,8 +105,8 @@ bool is_tiff(ImageBytes file) {
 
 unsigned exif_orientation(ImageBytes tiff) {
   if (tiff.size() < 2 || (tiff[0] != 'I' && tiff[0] != 'M') || tiff[0] != tiff[1]) return 1;
-  const std::uint64_t value = Directory(tiff).value(kOrientation, 1);
-  return value >= 1 && value <= 8 ? static_cast<unsigned>(value) : 1;
+  const uint64_t value = Directory(tiff).value(kOrientation, 1);
+  return value >= 1 && value <= 8 ? unsigned(value) : 1;
 }
 
 ImageHeader read_tiff_header(ImageBytes file, const std::string& name) {
@@ -124,33 +119,33 @@ ImageHeader read_tiff_header(ImageBytes file, const std::string& name) {
     return {.format = "camera raw", .supported = false, .width = header.width, .height = header.height};
   }
   header.orientation = exif_orientation(file);
-  header.bits = static_cast<unsigned>(std::min<std::uint64_t>(directory.value(kBits, 1), 64));
-  const std::uint64_t format = directory.value(kSampleFormat, 1);
+  header.bits = unsigned(std::min<uint64_t>(directory.value(kBits, 1), 64));
+  const uint64_t format = directory.value(kSampleFormat, 1);
   if (format == 2) header.samples = Samples::kSigned;
   if (format == 3 || format == 6) header.samples = Samples::kFloat;
-  const std::uint64_t photometric = directory.value(kPhotometric, kBlackIsZero);
+  const uint64_t photometric = directory.value(kPhotometric, kBlackIsZero);
   const bool is_one = photometric == kWhiteIsZero || photometric == kBlackIsZero || photometric == kPalette;
   header.is_white_zero = photometric == kWhiteIsZero;
   header.is_planar = directory.value(kPlanar, 1) == 2;
-  const auto bands = static_cast<unsigned>(std::min<std::uint64_t>(directory.value(kBands, 1), 65535));
+  const auto bands = unsigned(std::min<uint64_t>(directory.value(kBands, 1), 65535));
   header.colors = is_one ? 1 : photometric == kCmyk ? 4 : 3;
   if (bands < header.colors) throw FormatError(name, "damaged TIFF: it has too few bands for its colours");
   header.extras = bands - header.colors;
-  const std::uint64_t extra = directory.value(kExtraSamples, 0);
+  const uint64_t extra = directory.value(kExtraSamples, 0);
   if (header.extras > 0 && (extra == 1 || extra == 2)) {
     header.alpha = extra == 1 ? Alpha::kAssociated : Alpha::kStraight;
     --header.extras;
   }
-  const std::uint64_t compression = directory.value(kCompression, 1);
+  const uint64_t compression = directory.value(kCompression, 1);
   header.is_lossy =
       compression == kOldJpeg || compression == kJpeg || compression == kLossyWebp || compression == kJp2;
   return header;
 }
 
-std::vector<std::uint8_t> tiff_as_stored(ImageBytes file, const std::string& name) {
+std::vector<uint8_t> tiff_as_stored(ImageBytes file, const std::string& name) {
   const ImageHeader header = read_tiff_header(file, name);
   if (header.orientation == 1 && header.alpha != Alpha::kStraight) return {};
-  std::vector<std::uint8_t> out(file.begin(), file.end());
+  std::vector<uint8_t> out(file.begin(), file.end());
   const Directory directory(file);
   if (header.orientation != 1) directory.write(out, kOrientation, 1);
   if (header.alpha == Alpha::kStraight) directory.write(out, kExtraSamples, 1);

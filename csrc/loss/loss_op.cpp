@@ -1,22 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "loss/photometric.h"
 
-#include <cmath>
-#include <tuple>
-
 #include "common/op.h"
 
 namespace blitzgs {
 namespace {
 
-template <class T>
-void fill_window(T (&window)[kSsimTaps]) {
+template <class T> void fill_window(T (&window)[kSsimTaps]) {
   double values[kSsimTaps], total = 0;
   for (int i = 0; i < kSsimTaps; ++i) {
     values[i] = std::exp(-(i - kSsimRadius) * (i - kSsimRadius) / (2 * 1.5 * 1.5));
     total += values[i];
   }
-  for (int i = 0; i < kSsimTaps; ++i) window[i] = static_cast<T>(values[i] / total);
+  for (int i = 0; i < kSsimTaps; ++i) window[i] = T(values[i] / total);
 }
 
 // The weights of the sums in the loss whose gradient is computed.
@@ -29,11 +25,11 @@ struct PhotometricWeights {
 
 // weights null: no gradient. sums: whether the sums are wanted.
 Tensors<4> run_photometric(const Tensor& renders_in, const Tensor& targets_in, const OptionalTensor& masks_in,
-                           const PhotometricWeights* weights, bool sums, std::int64_t tile_size,
-                           std::int64_t tile_begin, std::int64_t tile_end) {
+                           const PhotometricWeights* weights, bool sums, int64_t tile_size,
+                           int64_t tile_begin, int64_t tile_end) {
   check_floating("renders", renders_in);
   check_shape("renders", renders_in, {-1, -1, -1, 3});
-  const std::int64_t views = renders_in.size(0), height = renders_in.size(1), width = renders_in.size(2);
+  const int64_t views = renders_in.size(0), height = renders_in.size(1), width = renders_in.size(2);
   check_shape("targets", targets_in, {views, height, width, 3});
   const bool bytes = targets_in.scalar_type() == ScalarType::Byte;
   if (!bytes) check_dtype("targets (if not uint8)", targets_in, renders_in.scalar_type());
@@ -41,17 +37,17 @@ Tensors<4> run_photometric(const Tensor& renders_in, const Tensor& targets_in, c
   BLITZGS_CHECK(tile_size > 0 && tile_size <= 4096, "tile_size must be in [1, 4096], got ", tile_size);
   BLITZGS_CHECK(height < (1 << 24) && width < (1 << 24), "images of ", width, " x ", height,
                 " pixels are beyond the limit of 2^24 a side");
-  const auto masks = checked<std::uint8_t>("masks", masks_in, {views, height, width});
+  const auto masks = checked<uint8_t>("masks", masks_in, {views, height, width});
   DeviceScope scope(renders_in);
   return dispatch_floating(renders_in, [&]<class T>() -> Tensors<4> {
     const auto renders = checked<T>("renders", renders_in, {views, height, width, 3});
     OptionalValues<const T> l1_weights, ssim_weights, samples;
-    OptionalValues<const std::int64_t> visible;
+    OptionalValues<const int64_t> visible;
     if (weights) {
       l1_weights.emplace(checked<T>("l1_weights", weights->l1, {views}));
       ssim_weights.emplace(checked<T>("ssim_weights", weights->ssim, {views}));
       samples = checked<T>("samples", weights->samples, {views});
-      visible = checked<std::int64_t>("visible", weights->visible, {views});
+      visible = checked<int64_t>("visible", weights->visible, {views});
     }
     const auto v_renders = make<T>(renders, {weights ? views : 0, height, width, 3});
     auto scale_reg = make<T>(renders, {visible ? views : 0}),
@@ -64,25 +60,22 @@ Tensors<4> run_photometric(const Tensor& renders_in, const Tensor& targets_in, c
     PhotometricArgs<T> args{};
     args.renders = renders;
     args.targets = bytes ? nullptr : data<T>(targets);
-    args.targets_u8 = bytes ? data<std::uint8_t>(targets) : nullptr;
+    args.targets_u8 = bytes ? data<uint8_t>(targets) : nullptr;
     args.masks = masks;
     args.l1_weights = l1_weights;
     args.ssim_weights = ssim_weights;
     args.samples = samples;
-    if (visible) {
-      args.means = {visible, static_cast<T>(weights->scale), static_cast<T>(weights->opacity), scale_reg,
-                    opacity_reg};
-    }
+    if (visible) args.means = {visible, T(weights->scale), T(weights->opacity), scale_reg, opacity_reg};
     args.v_renders = v_renders.data_if(weights != nullptr);
     args.clear_rest = !sums;
     args.views = views;
-    args.width = static_cast<int>(width);
-    args.height = static_cast<int>(height);
-    args.tile_size = static_cast<int>(tile_size);
-    args.tiles_x = static_cast<int>((width + tile_size - 1) / tile_size);
-    args.tiles_y = static_cast<int>((height + tile_size - 1) / tile_size);
+    args.width = int(width);
+    args.height = int(height);
+    args.tile_size = int(tile_size);
+    args.tiles_x = int((width + tile_size - 1) / tile_size);
+    args.tiles_y = int((height + tile_size - 1) / tile_size);
     args.tile_begin = tile_begin;
-    const std::int64_t tiles = views * args.tiles_x * args.tiles_y;
+    const int64_t tiles = views * args.tiles_x * args.tiles_y;
     args.tile_end = tile_end < 0 ? tiles : tile_end;
     check_tile_range(tile_begin, args.tile_end, tiles);
     fill_window(args.window);
@@ -94,10 +87,10 @@ Tensors<4> run_photometric(const Tensor& renders_in, const Tensor& targets_in, c
 }
 
 Tensors<2> photometric_fwd(const Tensor& renders, const Tensor& targets, const OptionalTensor& masks,
-                           std::int64_t tile_size, std::int64_t tile_begin, std::int64_t tile_end) {
+                           int64_t tile_size, int64_t tile_begin, int64_t tile_end) {
   const Tensor parts =
       std::get<0>(run_photometric(renders, targets, masks, nullptr, true, tile_size, tile_begin, tile_end));
-  const std::int64_t views = parts.size(0);
+  const int64_t views = parts.size(0);
   DeviceScope scope(renders);
   return dispatch_floating(renders, [&]<class T>() -> Tensors<2> {
     const auto l1_sums = make<T>(renders, {views}), ssim_sums = make<T>(renders, {views});
@@ -109,16 +102,16 @@ Tensors<2> photometric_fwd(const Tensor& renders, const Tensor& targets, const O
 }
 
 Tensor photometric_bwd(const Tensor& renders, const Tensor& targets, const OptionalTensor& masks,
-                       const Tensor& l1_weights, const Tensor& ssim_weights, std::int64_t tile_size,
-                       std::int64_t tile_begin, std::int64_t tile_end) {
+                       const Tensor& l1_weights, const Tensor& ssim_weights, int64_t tile_size,
+                       int64_t tile_begin, int64_t tile_end) {
   const PhotometricWeights weights{l1_weights, ssim_weights, {}, {}};
   return std::get<1>(
       run_photometric(renders, targets, masks, &weights, false, tile_size, tile_begin, tile_end));
 }
 
 Tensors<4> photometric_fwd_bwd(const Tensor& renders, const Tensor& targets, const OptionalTensor& masks,
-                               const Tensor& l1_weights, const Tensor& ssim_weights, std::int64_t tile_size,
-                               std::int64_t tile_begin, std::int64_t tile_end, const OptionalTensor& samples,
+                               const Tensor& l1_weights, const Tensor& ssim_weights, int64_t tile_size,
+                               int64_t tile_begin, int64_t tile_end, const OptionalTensor& samples,
                                const OptionalTensor& visible, double scale_weight, double opacity_weight) {
   const PhotometricWeights weights{l1_weights, ssim_weights, samples, visible, scale_weight, opacity_weight};
   return run_photometric(renders, targets, masks, &weights, true, tile_size, tile_begin, tile_end);
@@ -130,7 +123,7 @@ Tensors<2> l1_ssim_fwd_bwd(const Tensor& renders, const Tensor& targets, const T
   const PhotometricWeights weights{l1_weights, ssim_weights, samples, {}};
   const Tensors<4> out = run_photometric(renders, targets, std::nullopt, &weights, true, 16, 0, -1);
   const Tensor& parts = std::get<0>(out);
-  const std::int64_t n = parts.size(0) * parts.size(1);
+  const int64_t n = parts.size(0) * parts.size(1);
   DeviceScope scope(renders);
   return dispatch_floating(renders, [&]<class T>() -> Tensors<2> {
     const auto loss = make<T>(renders, {});
@@ -140,16 +133,16 @@ Tensors<2> l1_ssim_fwd_bwd(const Tensor& renders, const Tensor& targets, const T
   });
 }
 
-void report_(const OptionalTensor& parts_in, const OptionalTensor& tile_work_in, std::int64_t tile_begin,
-             std::int64_t tile_end, std::int64_t rank, std::int64_t n_ranks, const TensorList& targets) {
+void report_(const OptionalTensor& parts_in, const OptionalTensor& tile_work_in, int64_t tile_begin,
+             int64_t tile_end, int64_t rank, int64_t n_ranks, const TensorList& targets) {
   const auto parts = checked<double>("parts", parts_in, {-1, -1, 2});
-  const auto tile_work = checked<std::int32_t>("tile_work", tile_work_in, {-1});
-  const std::int64_t tiles = tile_work ? tile_work->size(0) : 0;
+  const auto tile_work = checked<int32_t>("tile_work", tile_work_in, {-1});
+  const int64_t tiles = tile_work ? tile_work->size(0) : 0;
   Report<float> report{
       parts, parts ? parts->size(0) : 0, parts ? parts->size(1) : 0, tile_work, tile_begin, tile_end, {}, 0};
   check_tile_range(tile_begin, tile_end, tiles);
   BLITZGS_CHECK(rank >= 0 && rank < n_ranks, "rank must be in [0, ", n_ranks, "), got ", rank);
-  const auto count = static_cast<std::int64_t>(targets.size());
+  const auto count = int64_t(targets.size());
   BLITZGS_CHECK(count > 0 && count <= kMaxReportTargets, "1 to ", kMaxReportTargets,
                 " targets are supported, got ", count);
   for (const Tensor& target : targets) {

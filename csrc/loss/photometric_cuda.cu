@@ -11,7 +11,6 @@
 //   5 The gradient; a thread has one column again.
 // All five steps run in every round, each on the rows that the step before it handled one round earlier, with
 // one barrier per round. The arithmetic of a pixel does not depend on how the image is divided into strips.
-#include <algorithm>
 #include <climits>
 
 #include "common/cuda.cuh"
@@ -19,7 +18,6 @@
 #include "loss/photometric_device.cuh"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 // Shared memory of one round; two rounds alternate.
@@ -32,16 +30,14 @@ struct Shared {
 
 // kLead: how many rows above its first row a strip starts to read. kWindowRound: the round of its first
 // windows. They are chosen such that sums are added in the same order with and without a gradient.
-template <bool kGradient>
-constexpr int kLead = kGradient ? 2 * kSsimRadius : kSsimRadius + 1;
+template <bool kGradient> constexpr int kLead = kGradient ? 2 * kSsimRadius : kSsimRadius + 1;
 constexpr int kWindowRound = 2;
 constexpr int kOutRound = 5;
 static_assert(kRows * kOutRound == 4 * kSsimRadius);
 
 // One block's work on its strip. Steps 2 and 5 have two forms. The plain form is for rounds whose rows are
 // all inside the image and owned as a whole, without a mask; nearly all rounds are of this kind.
-template <bool kBytes, bool kGradient, bool kSums>
-class StripWalk {
+template <bool kBytes, bool kGradient, bool kSums> class StripWalk {
  public:
   __device__ __forceinline__ StripWalk(const PhotometricArgs<float>& args, const Launch& launch,
                                        Shared* shared)
@@ -53,14 +49,14 @@ class StripWalk {
         width_(min(kOut, args.width - first_pixel_)),
         first_row_(strip_.begin - kLead<kGradient>),
         stride_(3 * args.width),
-        image_(std::int64_t{strip_.view} * args.height * args.width),
+        image_(int64_t{strip_.view} * args.height * args.width),
         channel_(threadIdx.x % 3),
         local_(threadIdx.x / 3) {
     const int pixel = first_pixel_ - 2 * kSsimRadius + local_;
     has_column_ = threadIdx.x < 3 * kIn && pixel >= 0 && pixel < args.width;
     in_core_ = has_column_ && local_ >= 2 * kSsimRadius && local_ < 2 * kSsimRadius + kOut;
-    next_ = 3 * (image_ + std::int64_t{first_row_} * args.width + pixel) + channel_;
-    out_ = 3 * (image_ + std::int64_t{strip_.begin} * args.width + first_pixel_ + local_) + channel_;
+    next_ = 3 * (image_ + int64_t{first_row_} * args.width + pixel) + channel_;
+    out_ = 3 * (image_ + int64_t{strip_.begin} * args.width + first_pixel_ + local_) + channel_;
     if constexpr (kGradient) {
       ssim_weight_ = weight_of(args, args.ssim_weights, strip_.view);
       l1_weight_ = weight_of(args, args.l1_weights, strip_.view);
@@ -68,7 +64,7 @@ class StripWalk {
       for (int i = threadIdx.x; i < 3 * kRows * 3 * kMidPitch; i += kThreads) {
         (&shared[0].columns[0][0][0][0])[i] = (&shared[1].columns[0][0][0][0])[i] = 0;
       }
-      const int map_pixel = first_pixel_ - kSsimRadius + static_cast<int>(threadIdx.x) % kMid;
+      const int map_pixel = first_pixel_ - kSsimRadius + int(threadIdx.x) % kMid;
       has_map_column_ = threadIdx.x < 3 * kMid && map_pixel >= 0 && map_pixel < args.width;
       __syncthreads();
     }
@@ -107,8 +103,8 @@ class StripWalk {
   }
 
   // The index of this block's part of the sums: part blockIdx.x of its strip.
-  __device__ __forceinline__ std::int64_t part(const Launch& launch) const {
-    return (std::int64_t{strip_.view} * launch.view_strips + strip_.index) * gridDim.x + blockIdx.x;
+  __device__ __forceinline__ int64_t part(const Launch& launch) const {
+    return (int64_t{strip_.view} * launch.view_strips + strip_.index) * gridDim.x + blockIdx.x;
   }
 
   float l1_sum = 0, ssim_sum = 0;
@@ -119,9 +115,8 @@ class StripWalk {
     return !args_.masks && top >= whole_.begin && top + kRows <= whole_.end;
   }
 
-  // Whether the mask includes the pixel.
   __device__ __forceinline__ bool counted(int row, int pixel) const {
-    return !args_.masks || args_.masks[image_ + std::int64_t{row} * args_.width + pixel];
+    return !args_.masks || args_.masks[image_ + int64_t{row} * args_.width + pixel];
   }
 
   // Loads this thread's column of the images for the rows of the next round.
@@ -129,8 +124,7 @@ class StripWalk {
     const bool all = row >= 0 && row + kRows <= args_.height;
 #pragma unroll
     for (int i = 0; i < kRows; ++i, next_ += stride_) {
-      const bool inside =
-          has_column_ && (all || static_cast<unsigned>(row + i) < static_cast<unsigned>(args_.height));
+      const bool inside = has_column_ && (all || unsigned(row + i) < unsigned(args_.height));
       x_[i] = inside ? args_.renders[next_] : 0.0f;
       y_[i] = inside ? targets_of<kBytes>(args_)[next_] : Target<kBytes>(0);
     }
@@ -166,8 +160,7 @@ class StripWalk {
   }
 
   // Step 2: the windows that are centred on the rows of the round from `top` on.
-  template <bool kPlain>
-  __device__ __forceinline__ void windows(Shared& shared, int top) {
+  template <bool kPlain> __device__ __forceinline__ void windows(Shared& shared, int top) {
     if (threadIdx.x >= kRows * 3 * kMidGroups) return;
     const Item item = item_of<kMidGroups>(threadIdx.x);
     float sums[4][4];
@@ -183,9 +176,8 @@ class StripWalk {
       const SsimTerms<float> terms = ssim_terms(sums[0][j], sums[1][j], sums[2][j], sums[3][j]);
       const int pixel = first_pixel_ + column + j;
       const bool counts =
-          kPlain || (in_rows && static_cast<unsigned>(pixel) < static_cast<unsigned>(args_.width) &&
-                     counted(row, pixel));
-      if (in_strip && static_cast<unsigned>(column + j) < static_cast<unsigned>(width_) &&
+          kPlain || (in_rows && unsigned(pixel) < unsigned(args_.width) && counted(row, pixel));
+      if (in_strip && unsigned(column + j) < unsigned(width_) &&
           (kPlain || (counts && owns_pixel(args_, strip_.view, row, pixel)))) {
         ssim_sum += terms.value;
       }
@@ -229,17 +221,15 @@ class StripWalk {
   }
 
   // Step 5: writes the gradient of the rows of the round from `top` on.
-  template <bool kPlain>
-  __device__ __forceinline__ void write_gradient(const Shared& shared, int top) {
+  template <bool kPlain> __device__ __forceinline__ void write_gradient(const Shared& shared, int top) {
     if (local_ >= width_) return;
     float x[kRows];
     Target<kBytes> y[kRows];
 #pragma unroll
     for (int i = 0; i < kRows; ++i) {
       const bool present = kPlain || top + i < strip_.end;
-      x[i] = present ? __ldg(args_.renders + out_ + i * std::int64_t{stride_}) : 0.0f;
-      y[i] =
-          present ? __ldg(targets_of<kBytes>(args_) + out_ + i * std::int64_t{stride_}) : Target<kBytes>(0);
+      x[i] = present ? __ldg(args_.renders + out_ + i * int64_t{stride_}) : 0.0f;
+      y[i] = present ? __ldg(targets_of<kBytes>(args_) + out_ + i * int64_t{stride_}) : Target<kBytes>(0);
     }
 #pragma unroll
     for (int i = 0; i < kRows; ++i, out_ += stride_) {
@@ -259,10 +249,10 @@ class StripWalk {
   Shared* shared_;
   const Strip strip_, whole_;
   const int first_pixel_, width_, first_row_, stride_;
-  const std::int64_t image_;
+  const int64_t image_;
   const int channel_, local_;  // the channel and the pixel of this thread's column, interleaved as in memory
   bool has_column_, in_core_, has_map_column_ = false;
-  std::int64_t next_, out_;  // the elements that this thread reads and writes next
+  int64_t next_, out_;  // the elements that this thread reads and writes next
   float ssim_weight_ = 0, l1_weight_ = 0;
   float x_[kRows];
   Target<kBytes> y_[kRows];
@@ -272,10 +262,10 @@ class StripWalk {
 
 // Sets the parts of missing strips to zero: a view may have fewer strips than others.
 __device__ void clear_parts(const PhotometricArgs<float>& args, const Launch& launch) {
-  const int rows = static_cast<int>(args.views) * launch.view_strips;
+  const int rows = int(args.views) * launch.view_strips;
   for (int i = blockIdx.y; i < rows; i += gridDim.y) {
     if (i % launch.view_strips < strips_of(launch, i / launch.view_strips)) continue;
-    double* part = args.parts + 2 * (std::int64_t{i} * gridDim.x + blockIdx.x);
+    double* part = args.parts + 2 * (int64_t{i} * gridDim.x + blockIdx.x);
     part[0] = part[1] = 0;
   }
 }
@@ -309,7 +299,6 @@ __global__ void __launch_bounds__(kThreads, 2)
 
 int cut(int rows, int rows_per_strip) { return (rows + rows_per_strip - 1) / rows_per_strip; }
 
-// The number of blocks that cover the width of an image.
 int block_columns(const PhotometricArgs<float>& args) { return (args.width + kOut - 1) / kOut; }
 
 // Divides the owned rows into strips such that the blocks fill whole waves of the device and few rows are
@@ -319,23 +308,22 @@ Launch cut_strips(const PhotometricArgs<float>& args) {
   launch.view_strips = 1;
   if (args.tile_begin == args.tile_end) return launch;
   const int columns = block_columns(args), slots = 2 * multiprocessors();
-  const std::int64_t tiles = std::int64_t{args.tiles_x} * args.tiles_y;
-  const std::int64_t last = args.tile_end - 1;
-  launch.first_view = static_cast<int>(args.tile_begin / tiles);
-  launch.last_view = static_cast<int>(last / tiles);
-  launch.begin_row = static_cast<int>(args.tile_begin % tiles / args.tiles_x * args.tile_size);
-  launch.end_row =
-      std::min(args.height, static_cast<int>((last % tiles / args.tiles_x + 1) * args.tile_size));
+  const int64_t tiles = int64_t{args.tiles_x} * args.tiles_y;
+  const int64_t last = args.tile_end - 1;
+  launch.first_view = int(args.tile_begin / tiles);
+  launch.last_view = int(last / tiles);
+  launch.begin_row = int(args.tile_begin % tiles / args.tiles_x * args.tile_size);
+  launch.end_row = std::min(args.height, int((last % tiles / args.tiles_x + 1) * args.tile_size));
   const int views = launch.last_view - launch.first_view;
   const int first_rows = (views ? args.height : launch.end_row) - launch.begin_row;
   constexpr int kLeadCost = 24;  // the work of a strip before its first output, in rows
-  std::int64_t best_cost = LLONG_MAX;
+  int64_t best_cost = LLONG_MAX;
   for (int pieces = 1; pieces <= cut(args.height, 16); ++pieces) {
     const int rows = cut(cut(args.height, pieces), kRows) * kRows;
     int strips = cut(first_rows, rows);
     if (views) strips += (views - 1) * cut(args.height, rows) + cut(launch.end_row, rows);
-    const std::int64_t waves = (std::int64_t{columns} * strips + slots - 1) / slots;
-    const std::int64_t cost = waves * (rows + kLeadCost);
+    const int64_t waves = (int64_t{columns} * strips + slots - 1) / slots;
+    const int64_t cost = waves * (rows + kLeadCost);
     if (cost >= best_cost) continue;
     best_cost = cost;
     launch.strips = strips;
@@ -356,23 +344,21 @@ void launch_strips(dim3 grid, const PhotometricArgs<float>& args, const Launch& 
 
 // Sets v_renders to zero before the first row and after the last row with an owned pixel.
 void clear_rest(const PhotometricArgs<float>& args, const Launch& launch, cudaStream_t stream) {
-  const std::int64_t row = 3 * std::int64_t{args.width};
-  const std::int64_t begin = (std::int64_t{launch.first_view} * args.height + launch.begin_row) * row;
-  const std::int64_t end = (std::int64_t{launch.last_view} * args.height + launch.end_row) * row;
-  const std::int64_t total = args.views * args.height * row;
+  const int64_t row = 3 * int64_t{args.width};
+  const int64_t begin = (int64_t{launch.first_view} * args.height + launch.begin_row) * row;
+  const int64_t end = (int64_t{launch.last_view} * args.height + launch.end_row) * row;
+  const int64_t total = args.views * args.height * row;
   check(cudaMemsetAsync(args.v_renders, 0, begin * sizeof(float), stream), "photometric");
   check(cudaMemsetAsync(args.v_renders + end, 0, (total - end) * sizeof(float), stream), "photometric");
 }
 
 }  // namespace
 
-template <class T>
-std::int64_t photometric_parts(const PhotometricArgs<T>& args) {
-  return std::int64_t{cut_strips(args).view_strips} * block_columns(args);
+template <class T> int64_t photometric_parts(const PhotometricArgs<T>& args) {
+  return int64_t{cut_strips(args).view_strips} * block_columns(args);
 }
 
-template <class T>
-void photometric(const PhotometricArgs<T>& args, Workspace&, CudaStream stream) {
+template <class T> void photometric(const PhotometricArgs<T>& args, Workspace&, CudaStream stream) {
   const Launch launch = cut_strips(args);
   const dim3 grid(block_columns(args), std::max(launch.strips, 1));
   args.targets_u8 ? launch_strips<true>(grid, args, launch, stream)
@@ -380,7 +366,7 @@ void photometric(const PhotometricArgs<T>& args, Workspace&, CudaStream stream) 
   if (args.v_renders && args.clear_rest) clear_rest(args, launch, stream);
 }
 
-template std::int64_t photometric_parts<float>(const PhotometricArgs<float>&);
+template int64_t photometric_parts<float>(const PhotometricArgs<float>&);
 template void photometric<float>(const PhotometricArgs<float>&, Workspace&, CudaStream);
 
 }  // namespace blitzgs::cuda

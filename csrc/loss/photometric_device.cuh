@@ -1,12 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 // Helpers of the kernel in photometric_cuda.cu: sizes, ownership, the vertical and horizontal windows.
 #pragma once
-#include <type_traits>
-
 #include "loss/photometric.h"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 constexpr int kThreads = 256;
@@ -60,14 +57,13 @@ __device__ inline int strips_of(const Launch& launch, int view) {
 
 // The rows of a strip whose pixels are all owned.
 __device__ inline Strip whole_rows(const PhotometricArgs<float>& args, const Strip& strip) {
-  const std::int64_t first = std::int64_t{strip.view} * args.tiles_x * args.tiles_y;
-  const std::int64_t begin = max(args.tile_begin - first, std::int64_t{0});
-  const std::int64_t end = max(args.tile_end - first, std::int64_t{0});
-  const std::int64_t top = (begin + args.tiles_x - 1) / args.tiles_x * args.tile_size;
-  const std::int64_t bottom = end / args.tiles_x * args.tile_size;
-  return {strip.view, strip.index,
-          static_cast<int>(min(max(top, std::int64_t{strip.begin}), std::int64_t{strip.end})),
-          static_cast<int>(min(bottom, std::int64_t{strip.end}))};
+  const int64_t first = int64_t{strip.view} * args.tiles_x * args.tiles_y;
+  const int64_t begin = max(args.tile_begin - first, int64_t{0});
+  const int64_t end = max(args.tile_end - first, int64_t{0});
+  const int64_t top = (begin + args.tiles_x - 1) / args.tiles_x * args.tile_size;
+  const int64_t bottom = end / args.tiles_x * args.tile_size;
+  return {strip.view, strip.index, int(min(max(top, int64_t{strip.begin}), int64_t{strip.end})),
+          int(min(bottom, int64_t{strip.end}))};
 }
 
 __device__ inline bool owns_pixel(const PhotometricArgs<float>& args, int view, int row, int column) {
@@ -77,8 +73,7 @@ __device__ inline bool owns_pixel(const PhotometricArgs<float>& args, int view, 
 
 // Targets keep the type in which they were loaded until they are used, because a conversion right after the
 // load would wait for the load.
-template <bool kBytes>
-using Target = std::conditional_t<kBytes, std::uint8_t, float>;
+template <bool kBytes> using Target = std::conditional_t<kBytes, uint8_t, float>;
 
 template <bool kBytes>
 __device__ __forceinline__ const Target<kBytes>* targets_of(const PhotometricArgs<float>& args) {
@@ -91,7 +86,7 @@ __device__ __forceinline__ const Target<kBytes>* targets_of(const PhotometricArg
 
 // The value of a target in [0, 1]. __fmul_rn rounds it: if the compiler contracted the product into a
 // following subtraction, the difference of equal pixels would not be zero.
-__device__ __forceinline__ float target_value(std::uint8_t target) {
+__device__ __forceinline__ float target_value(uint8_t target) {
   // This converts the integer to a float through its bits, because conversion instructions are slow.
   const float value = __uint_as_float(0x4b000000u | target) - 8388608.0f;
   return __fmul_rn(value, 1.0f / 255.0f);
@@ -132,8 +127,7 @@ __device__ __forceinline__ void convolve4(const float (&window)[kSsimTaps], cons
 struct Item {
   int row, channel, pixel;
 };
-template <int kGroups>
-__device__ __forceinline__ Item item_of(int thread) {
+template <int kGroups> __device__ __forceinline__ Item item_of(int thread) {
   const int row = thread / (3 * kGroups), rest = thread - row * 3 * kGroups;
   return {row, rest / kGroups, 4 * (rest % kGroups)};
 }

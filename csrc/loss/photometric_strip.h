@@ -9,7 +9,6 @@
 // taps are 3 floats apart in a row.
 #pragma once
 #include <algorithm>
-#include <cmath>
 #include <memory>
 
 #include "loss/photometric.h"
@@ -23,10 +22,9 @@ namespace {
 constexpr int kPad = 3 * kSsimRadius;
 
 // out [count] = the horizontal convolution of a row that is padded by kPad zeros on both sides.
-template <class T>
-void convolve_row(const T* window, const T* padded, std::int64_t count, T* out) {
+template <class T> void convolve_row(const T* window, const T* padded, int64_t count, T* out) {
 #pragma GCC ivdep
-  for (std::int64_t i = 0; i < count; ++i) {
+  for (int64_t i = 0; i < count; ++i) {
     const T* in = padded + i;
     T sum = window[5] * in[15];
     sum += window[4] * (in[12] + in[18]);
@@ -38,12 +36,11 @@ void convolve_row(const T* window, const T* padded, std::int64_t count, T* out) 
   }
 }
 
-template <class T>
-class PhotometricStrip {
+template <class T> class PhotometricStrip {
  public:
   explicit PhotometricStrip(const PhotometricArgs<T>& args)
       : args_(args),
-        count_(3 * static_cast<std::int64_t>(args.width)),
+        count_(3 * int64_t(args.width)),
         padded_(count_ + 2 * kPad),
         buffer_(new T[7 * padded_ + (4 + 3) * (kSsimTaps + 1) * count_]()) {
     T* next = buffer_.get();
@@ -58,7 +55,7 @@ class PhotometricStrip {
   }
 
   // Computes rows [begin, end) of one view: adds to the sums and writes the gradient.
-  void run(std::int64_t view, int begin, int end, double* l1, double* ssim) {
+  void run(int64_t view, int begin, int end, double* l1, double* ssim) {
     const bool gradient = args_.l1_weights != nullptr;
     const int reach = gradient ? kSsimRadius : 0;
     for (int row = begin - reach - kSsimRadius; row < end + reach + kSsimRadius; ++row) {
@@ -77,25 +74,25 @@ class PhotometricStrip {
  private:
   static int slot(int row) { return (row + 4 * kSsimTaps) % kSsimTaps; }
 
-  T target(std::int64_t at) const {
-    return args_.targets ? args_.targets[at] : static_cast<T>(args_.targets_u8[at]) * (T(1) / T(255));
+  T target(int64_t at) const {
+    return args_.targets ? args_.targets[at] : T(args_.targets_u8[at]) * (T(1) / T(255));
   }
 
-  std::int64_t start_of(std::int64_t view, int row) const { return (view * args_.height + row) * count_; }
+  int64_t start_of(int64_t view, int row) const { return (view * args_.height + row) * count_; }
 
-  void absorb_input(std::int64_t view, int row) {
+  void absorb_input(int64_t view, int row) {
     if (row < 0 || row >= args_.height) {
       for (auto& quantity : ring1_) std::fill_n(quantity[slot(row)], count_, T(0));
       return;
     }
-    const std::int64_t start = start_of(view, row);
+    const int64_t start = start_of(view, row);
     const T* x = args_.renders + start;
     T *r0 = padded_rows_[0] + kPad, *r1 = padded_rows_[1] + kPad, *r2 = padded_rows_[2] + kPad,
       *r3 = padded_rows_[3] + kPad;
 #pragma GCC ivdep
-    for (std::int64_t i = 0; i < count_; ++i) r1[i] = target(start + i);
+    for (int64_t i = 0; i < count_; ++i) r1[i] = target(start + i);
 #pragma GCC ivdep
-    for (std::int64_t i = 0; i < count_; ++i) {
+    for (int64_t i = 0; i < count_; ++i) {
       const T y = r1[i], difference = x[i] - y;
       r0[i] = x[i];
       r1[i] = difference;
@@ -114,7 +111,7 @@ class PhotometricStrip {
     const T w0 = args_.window[0], w1 = args_.window[1], w2 = args_.window[2], w3 = args_.window[3],
             w4 = args_.window[4], w5 = args_.window[5];
 #pragma GCC ivdep
-    for (std::int64_t i = 0; i < count_; ++i) {
+    for (int64_t i = 0; i < count_; ++i) {
       T sum = w5 * f[i];
       sum += w4 * (e[i] + g[i]);
       sum += w3 * (d[i] + h[i]);
@@ -127,49 +124,49 @@ class PhotometricStrip {
 
   // Writes the SSIM of each pixel to windows_[0], and its derivatives, weighted and masked, to padded rows 4
   // to 6.
-  void compute_windows(std::int64_t view, int centre) {
+  void compute_windows(int64_t view, int centre) {
     for (int q = 0; q < 4; ++q) gather(ring1_[q], centre, windows_[q]);
     T *w0 = windows_[0], *w1 = windows_[1], *w2 = windows_[2], *w3 = windows_[3];
     if (!args_.l1_weights) {
 #pragma GCC ivdep
-      for (std::int64_t i = 0; i < count_; ++i) w0[i] = ssim_terms(w0[i], w1[i], w2[i], w3[i]).value;
+      for (int64_t i = 0; i < count_; ++i) w0[i] = ssim_terms(w0[i], w1[i], w2[i], w3[i]).value;
       return;
     }
     T *m = padded_rows_[4] + kPad, *p = padded_rows_[5] + kPad, *q = padded_rows_[6] + kPad;
     const T weight = weight_of(args_, args_.ssim_weights, view);
 #pragma GCC ivdep
-    for (std::int64_t i = 0; i < count_; ++i) {
+    for (int64_t i = 0; i < count_; ++i) {
       const SsimTerms<T> terms = ssim_terms(w0[i], w1[i], w2[i], w3[i]);
       w0[i] = terms.value;
       m[i] = weight * terms.by_mean;
       p[i] = weight * terms.by_p;
       q[i] = weight * terms.by_q;
     }
-    if (const std::uint8_t* mask = mask_row(view, centre)) {
-      for (std::int64_t i = 0; i < count_; ++i) {
+    if (const uint8_t* mask = mask_row(view, centre)) {
+      for (int64_t i = 0; i < count_; ++i) {
         if (!mask[i / 3]) m[i] = p[i] = q[i] = 0;
       }
     }
   }
 
-  const std::uint8_t* mask_row(std::int64_t view, int row) const {
+  const uint8_t* mask_row(int64_t view, int row) const {
     return args_.masks ? args_.masks + (view * args_.height + row) * args_.width : nullptr;
   }
 
   // Adds the L1 and SSIM of the owned pixels of a row. Eight partial sums give the same order of additions
   // for every vector width.
-  void add_sums(std::int64_t view, int centre, double* l1, double* ssim) const {
+  void add_sums(int64_t view, int centre, double* l1, double* ssim) const {
     const OwnedColumns owned = owned_columns(args_, view, centre);
-    const std::int64_t start = start_of(view, centre);
-    const std::uint8_t* mask = mask_row(view, centre);
+    const int64_t start = start_of(view, centre);
+    const uint8_t* mask = mask_row(view, centre);
     double differences[8] = {}, values[8] = {};
-    const auto add = [&](std::int64_t i, int lane) {
+    const auto add = [&](int64_t i, int lane) {
       if (mask && !mask[i / 3]) return;
-      differences[lane] += static_cast<double>(std::fabs(args_.renders[start + i] - target(start + i)));
-      values[lane] += static_cast<double>(windows_[0][i]);
+      differences[lane] += double(std::fabs(args_.renders[start + i] - target(start + i)));
+      values[lane] += double(windows_[0][i]);
     };
-    std::int64_t i = 3 * std::int64_t{owned.begin};
-    const std::int64_t last = 3 * std::int64_t{owned.end};
+    int64_t i = 3 * int64_t{owned.begin};
+    const int64_t last = 3 * int64_t{owned.end};
     for (; i + 8 <= last; i += 8) {
       for (int lane = 0; lane < 8; ++lane) add(i + lane, lane);
     }
@@ -188,29 +185,29 @@ class PhotometricStrip {
     }
   }
 
-  void write_gradient(std::int64_t view, int row) {
+  void write_gradient(int64_t view, int row) {
     const OwnedColumns owned = owned_columns(args_, view, row);
     for (int q = 0; q < 3; ++q) gather(ring2_[q], row, windows_[q]);
-    const std::int64_t start = start_of(view, row);
+    const int64_t start = start_of(view, row);
     const T* x = args_.renders + start;
     T* out = args_.v_renders + start;
     const T *m = windows_[0], *p = windows_[1], *q = windows_[2];
     const T weight = weight_of(args_, args_.l1_weights, view);
-    const std::uint8_t* mask = mask_row(view, row);
-    const std::int64_t first = 3 * std::int64_t{owned.begin}, last = 3 * std::int64_t{owned.end};
+    const uint8_t* mask = mask_row(view, row);
+    const int64_t first = 3 * int64_t{owned.begin}, last = 3 * int64_t{owned.end};
     std::fill_n(out, first, T(0));
     std::fill_n(out + last, count_ - last, T(0));
 #pragma GCC ivdep
-    for (std::int64_t i = first; i < last; ++i) {
+    for (int64_t i = first; i < last; ++i) {
       const T difference = x[i] - target(start + i);
-      const T sign = static_cast<T>((difference > 0) - (difference < 0));
+      const T sign = T((difference > 0) - (difference < 0));
       const T l1 = !mask || mask[i / 3] ? weight * sign : T(0);
       out[i] = l1 + m[i] + T(2) * (x[i] * p[i] + difference * q[i]);
     }
   }
 
   const PhotometricArgs<T>& args_;
-  std::int64_t count_, padded_;
+  int64_t count_, padded_;
   std::unique_ptr<T[]> buffer_;
   T* padded_rows_[7];
   T* windows_[4];
@@ -220,13 +217,13 @@ class PhotometricStrip {
 
 // Computes strips[begin .. end). The sums of strip s are added to sums[2 s] (L1) and sums[2 s + 1] (SSIM).
 template <class T>
-void run_photometric_strips(const PhotometricArgs<T>& args, const std::int64_t* strips, std::int64_t begin,
-                            std::int64_t end, double* sums) {
+void run_photometric_strips(const PhotometricArgs<T>& args, const int64_t* strips, int64_t begin, int64_t end,
+                            double* sums) {
   PhotometricStrip<T> worker(args);
-  const std::int64_t per_view = (args.height + kStripRows - 1) / kStripRows;
-  for (std::int64_t i = begin; i < end; ++i) {
-    const std::int64_t strip = strips[i];
-    const int first = static_cast<int>(strip % per_view) * kStripRows;
+  const int64_t per_view = (args.height + kStripRows - 1) / kStripRows;
+  for (int64_t i = begin; i < end; ++i) {
+    const int64_t strip = strips[i];
+    const int first = int(strip % per_view) * kStripRows;
     const int last = first + kStripRows < args.height ? first + kStripRows : args.height;
     worker.run(strip / per_view, first, last, sums + 2 * strip, sums + 2 * strip + 1);
   }

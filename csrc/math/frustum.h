@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // A conservative test whether a view may see a Gaussian, from its mean and an upper bound sigma on its
-// standard deviations. Three callers use these planes: the tests of table blocks and of their rows
-// (active/blocks.h) and the prefilter of the projection (project/project_cuda.cu).
+// standard deviations, for blocks and rows of the table (active/blocks.h) and the projection's prefilter.
 //
 // A Gaussian with axes up to sigma cannot be seen iff its mean lies behind the near plane, beyond the far
 // plane, or beyond one image border by more than a splat can reach: half-width of alpha >= 1/255 is at most
@@ -9,8 +8,6 @@
 // max |row_x - u row_z| over the clamped slopes u. Multiplied by z, each condition is a linear inequality
 // n . p + d + k sigma >= 0.
 #pragma once
-#include <cmath>
-
 #include "math/projection.h"
 #include "math/vec.h"
 
@@ -31,15 +28,11 @@ struct Frustum {
   FrustumPlane planes[kFrustumPlanes];
 };
 
-namespace frustum {
-
-// A row of the world-to-camera transform.
 struct PoseRow {
   double n[3], offset;
 };
 
-template <class T>
-BLITZGS_HD PoseRow pose_row(const Vec3<T>& row, T offset) {
+template <class T> BLITZGS_HD PoseRow pose_row(const Vec3<T>& row, T offset) {
   return {{double(row.x), double(row.y), double(row.z)}, double(offset)};
 }
 
@@ -49,12 +42,12 @@ BLITZGS_HD FrustumPlane make_plane(const PoseRow& row, double factor, const Pose
   FrustumPlane plane;
   float largest = 0.0f;
   for (int axis = 0; axis < 3; ++axis) {
-    plane.n[axis] = static_cast<float>(factor * row.n[axis] + factor_z * row_z.n[axis]);
+    plane.n[axis] = float(factor * row.n[axis] + factor_z * row_z.n[axis]);
     largest = larger(largest, std::fabs(plane.n[axis]));
   }
-  plane.d = static_cast<float>(factor * row.offset + factor_z * row_z.offset + shift);
+  plane.d = float(factor * row.offset + factor_z * row_z.offset + shift);
   plane.d_high = plane.d + kPointSlack * std::fabs(plane.d);
-  plane.k = static_cast<float>(k);
+  plane.k = float(k);
   plane.n_error = kPointSlack * largest;
   return plane;
 }
@@ -70,24 +63,21 @@ BLITZGS_HD double largest_gradient(const PoseRow& row, const PoseRow& row_z, dou
   return std::sqrt(larger(squares[0], squares[1]));
 }
 
-}  // namespace frustum
-
 template <class T>
 BLITZGS_HD Frustum make_frustum(const Camera<T>& camera, int width, int height, T near_plane, T far_plane,
                                 T eps2d) {
-  using frustum::make_plane, frustum::pose_row;
   constexpr double kReach = 3.34;  // > sqrt(2 ln 255)
-  const frustum::PoseRow x = pose_row(camera.row_x, camera.translation.x),
-                         y = pose_row(camera.row_y, camera.translation.y),
-                         z = pose_row(camera.row_z, camera.translation.z);
+  const PoseRow x = pose_row(camera.row_x, camera.translation.x),
+                y = pose_row(camera.row_y, camera.translation.y),
+                z = pose_row(camera.row_z, camera.translation.z);
   Frustum view;
   view.planes[0] = make_plane(z, 1.0, z, 0.0, -double(near_plane), 0.0);
   // A depth is rounded before it is compared with the far plane.
   view.planes[1] = make_plane(z, -1.0, z, 0.0, 1.000001 * double(far_plane), 0.0);
   const double blur = kReach * std::sqrt(double(eps2d)) + 1.0;  // one pixel of slack
-  const auto add_borders = [&](FrustumPlane* planes, const frustum::PoseRow& row, double focal, double centre,
+  const auto add_borders = [&](FrustumPlane* planes, const PoseRow& row, double focal, double centre,
                                double size, double low, double high) {
-    const double k = kReach * std::fabs(focal) * frustum::largest_gradient(row, z, low, high) * 1.00001;
+    const double k = kReach * std::fabs(focal) * largest_gradient(row, z, low, high) * 1.00001;
     planes[0] = make_plane(row, focal, z, centre + blur, 0.0, k);
     planes[1] = make_plane(row, -focal, z, size - centre + blur, 0.0, k);
   };

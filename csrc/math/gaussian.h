@@ -6,27 +6,22 @@
 
 #include "math/vec.h"
 
-// Rotations from unnormalised quaternions (w, x, y, z), and the derivative.
-
 namespace blitzgs {
 
 // The three columns of a 3x3 matrix: the images of the unit axes.
-template <class T>
-struct Columns3 {
+template <class T> struct Columns3 {
   Vec3<T> x, y, z;
 };
 
-template <class T>
-struct UnitQuaternion {
+template <class T> struct UnitQuaternion {
   T w, x, y, z;
   T inverse_norm;  // 1 / |q| of the quaternion it came from; 0 when that was zero
 };
 
-// A quaternion of zeros gives the identity, with a gradient of zero, and so does one that is so short that
-// its inverse norm would overflow. The squares of very large or very small components leave the range of
-// float, so such quaternions are first divided by their largest component.
-template <class T>
-BLITZGS_HD UnitQuaternion<T> normalize_quaternion(const T* q) {
+// A quaternion of zeros, or one so short that its inverse norm would overflow, gives the identity and a
+// gradient of zero. The squares of very large or small components leave the range of float, so such
+// quaternions are first divided by their largest component.
+template <class T> BLITZGS_HD UnitQuaternion<T> normalize_quaternion(const T* q) {
   T scale = T(1);
   T squared = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
   if (!(squared > T(1e-24) && squared < T(1e24))) {
@@ -43,8 +38,7 @@ BLITZGS_HD UnitQuaternion<T> normalize_quaternion(const T* q) {
   return {q[0] * inverse, q[1] * inverse, q[2] * inverse, q[3] * inverse, inverse};
 }
 
-template <class T>
-BLITZGS_HD Columns3<T> rotation_columns(const UnitQuaternion<T>& q) {
+template <class T> BLITZGS_HD Columns3<T> rotation_columns(const UnitQuaternion<T>& q) {
   const T w = q.w, x = q.x, y = q.y, z = q.z;
   return {{T(1) - T(2) * (y * y + z * z), T(2) * (x * y + w * z), T(2) * (x * z - w * y)},
           {T(2) * (x * y - w * z), T(1) - T(2) * (x * x + z * z), T(2) * (y * z + w * x)},
@@ -70,24 +64,16 @@ BLITZGS_HD void rotation_columns_vjp(const UnitQuaternion<T>& q, const Columns3<
   v_q[3] += q.inverse_norm * (v_z - along * z);
 }
 
-// Activations, and the 3D covariance (Kerbl et al. 2023, Eq. 6) in factored form: Sigma = A A^T with
-// A = R(q) diag(s). The code keeps the factor A, because the projection is more accurate from it
-// (projection.h).
+// Activations, and the 3D covariance (Kerbl et al. 2023, Eq. 6) in factored form: Sigma = A A^T with A = R(q)
+// diag(s). The projection is more accurate from A (projection.h).
 
-template <class T>
-BLITZGS_HD T sigmoid(T logit) {
-  return T(1) / (T(1) + std::exp(-logit));
-}
+template <class T> BLITZGS_HD T sigmoid(T logit) { return T(1) / (T(1) + std::exp(-logit)); }
 
 // d sigmoid / d logit from the value o of the sigmoid.
-template <class T>
-BLITZGS_HD T sigmoid_slope(T o) {
-  return o * (T(1) - o);
-}
+template <class T> BLITZGS_HD T sigmoid_slope(T o) { return o * (T(1) - o); }
 
 // A = R diag(s): the Gaussian's axes, one column each.
-template <class T>
-BLITZGS_HD Columns3<T> scaled_axes(const Columns3<T>& rotation, const Vec3<T>& scale) {
+template <class T> BLITZGS_HD Columns3<T> scaled_axes(const Columns3<T>& rotation, const Vec3<T>& scale) {
   return {scale.x * rotation.x, scale.y * rotation.y, scale.z * rotation.z};
 }
 
@@ -108,8 +94,7 @@ inline constexpr int kMaxShBasis = 16;
 BLITZGS_HD int sh_basis_count(int degree) { return (degree + 1) * (degree + 1); }
 
 // basis[0 .. (degree + 1)^2) at the unit direction d.
-template <class T>
-BLITZGS_HD void sh_basis(int degree, const Vec3<T>& d, T* basis) {
+template <class T> BLITZGS_HD void sh_basis(int degree, const Vec3<T>& d, T* basis) {
   basis[0] = T(0.28209479177387814);
   if (degree < 1) return;
   const T x = d.x, y = d.y, z = d.z;
@@ -134,8 +119,7 @@ BLITZGS_HD void sh_basis(int degree, const Vec3<T>& d, T* basis) {
 }
 
 // Gradient of sum_k v_basis[k] * basis[k] with respect to the direction.
-template <class T>
-BLITZGS_HD Vec3<T> sh_basis_vjp(int degree, const Vec3<T>& d, const T* v) {
+template <class T> BLITZGS_HD Vec3<T> sh_basis_vjp(int degree, const Vec3<T>& d, const T* v) {
   Vec3<T> g{T(0), T(0), T(0)};
   if (degree < 1) return g;
   const T x = d.x, y = d.y, z = d.z;

@@ -3,8 +3,7 @@
 // in all files (and for float64). Each operation gives the same bits in both, NaN included:
 //   min(a, b), max(a, b)  return b when either is NaN;   comparisons with NaN are false;
 //   sum()                 adds in one fixed order.
-// The types are in an unnamed namespace, because files that are compiled for different instruction sets must
-// not share their inline functions.
+// Files for different instruction sets must not share inline functions, so the types have internal linkage.
 #pragma once
 #include <bit>
 #include <cmath>
@@ -21,21 +20,18 @@ namespace {
 constexpr int kLanes = 8;
 
 // Eight values, of lane i f(i).
-template <class Eight, class F>
-Eight make_eight(F f) {
+template <class Eight, class F> Eight make_eight(F f) {
   Eight r;
   for (int i = 0; i < kLanes; ++i) r.v[i] = f(i);
   return r;
 }
 
 // Eight values, f of those of each lane.
-template <class Eight, class F, class... Lanes>
-Eight map_eight(F f, Lanes... lanes) {
+template <class Eight, class F, class... Lanes> Eight map_eight(F f, Lanes... lanes) {
   return make_eight<Eight>([&](int i) { return f(lanes.v[i]...); });
 }
 
-template <class T>
-struct PlainLanes {
+template <class T> struct PlainLanes {
   using Scalar = T;
   struct Mask {
     bool v[kLanes];
@@ -44,19 +40,19 @@ struct PlainLanes {
     bool any() const { return bits() != 0; }
     unsigned bits() const {
       unsigned result = 0;
-      for (int i = 0; i < kLanes; ++i) result |= static_cast<unsigned>(v[i]) << i;
+      for (int i = 0; i < kLanes; ++i) result |= unsigned(v[i]) << i;
       return result;
     }
   };
   struct Int {
-    std::int32_t v[kLanes];
-    static Int load(const std::int32_t* p) {
+    int32_t v[kLanes];
+    static Int load(const int32_t* p) {
       return make_eight<Int>([&](int i) { return p[i]; });
     }
-    void store(std::int32_t* p) const {
+    void store(int32_t* p) const {
       for (int i = 0; i < kLanes; ++i) p[i] = v[i];
     }
-    static Int broadcast(std::int32_t x) {
+    static Int broadcast(int32_t x) {
       return make_eight<Int>([&](int) { return x; });
     }
     static Mask greater(Int a, Int b) { return map_eight<Mask>(std::greater<>(), a, b); }
@@ -67,12 +63,8 @@ struct PlainLanes {
 
   T v[kLanes];
 
-  template <class F>
-  static PlainLanes make(F f) {
-    return make_eight<PlainLanes>(f);
-  }
-  template <class F>
-  static PlainLanes map(F f, PlainLanes a, PlainLanes b) {
+  template <class F> static PlainLanes make(F f) { return make_eight<PlainLanes>(f); }
+  template <class F> static PlainLanes map(F f, PlainLanes a, PlainLanes b) {
     return map_eight<PlainLanes>(f, a, b);
   }
   static PlainLanes map(T (*f)(T), PlainLanes a) { return map_eight<PlainLanes>(f, a); }
@@ -87,7 +79,7 @@ struct PlainLanes {
   }
   static PlainLanes zero() { return broadcast(T(0)); }
   static PlainLanes iota() {
-    return make([](int i) { return static_cast<T>(i); });
+    return make([](int i) { return T(i); });
   }
   friend PlainLanes operator+(PlainLanes a, PlainLanes b) { return map(std::plus<>(), a, b); }
   friend PlainLanes operator-(PlainLanes a, PlainLanes b) { return map(std::minus<>(), a, b); }
@@ -119,8 +111,8 @@ struct PlainLanes {
   static PlainLanes scale_exponent(PlainLanes a, PlainLanes n) {
     return make([&](int i) {
       if (n.v[i] != n.v[i]) return a.v[i];
-      const auto shift = static_cast<std::uint32_t>(static_cast<std::int32_t>(n.v[i])) << 23;
-      return std::bit_cast<T>(std::bit_cast<std::uint32_t>(a.v[i]) + shift);
+      const auto shift = uint32_t(int32_t(n.v[i])) << 23;
+      return std::bit_cast<T>(std::bit_cast<uint32_t>(a.v[i]) + shift);
     });
   }
   static Mask greater_equal(PlainLanes a, PlainLanes b) {
@@ -134,9 +126,8 @@ struct PlainLanes {
     return make([&](int i) { return m.v[i] ? a.v[i] : T(0); });
   }
   Int to_int() const {  // truncates; a value that does not fit becomes the lowest integer
-    return make_eight<Int>([&](int i) {
-      return std::fabs(v[i]) < T(2147483648.0) ? static_cast<std::int32_t>(v[i]) : INT32_MIN;
-    });
+    return make_eight<Int>(
+        [&](int i) { return std::fabs(v[i]) < T(2147483648.0) ? int32_t(v[i]) : INT32_MIN; });
   }
   T sum() const {
     const T a = v[0] + v[4], b = v[1] + v[5], c = v[2] + v[6], d = v[3] + v[7];
@@ -152,15 +143,13 @@ struct Avx2Lanes {
     friend Mask operator&(Mask a, Mask b) { return {_mm256_and_ps(a.v, b.v)}; }
     Mask and_not(Mask b) const { return {_mm256_andnot_ps(b.v, v)}; }
     bool any() const { return !_mm256_testz_ps(v, v); }
-    unsigned bits() const { return static_cast<unsigned>(_mm256_movemask_ps(v)); }
+    unsigned bits() const { return unsigned(_mm256_movemask_ps(v)); }
   };
   struct Int {
     __m256i v;
-    static Int load(const std::int32_t* p) {
-      return {_mm256_loadu_si256(reinterpret_cast<const __m256i*>(p))};
-    }
-    void store(std::int32_t* p) const { _mm256_storeu_si256(reinterpret_cast<__m256i*>(p), v); }
-    static Int broadcast(std::int32_t x) { return {_mm256_set1_epi32(x)}; }
+    static Int load(const int32_t* p) { return {_mm256_loadu_si256(reinterpret_cast<const __m256i*>(p))}; }
+    void store(int32_t* p) const { _mm256_storeu_si256(reinterpret_cast<__m256i*>(p), v); }
+    static Int broadcast(int32_t x) { return {_mm256_set1_epi32(x)}; }
     static Mask greater(Int a, Int b) { return {_mm256_castsi256_ps(_mm256_cmpgt_epi32(a.v, b.v))}; }
     static Int select(Mask m, Int a, Int b) {
       return {_mm256_castps_si256(_mm256_blendv_ps(_mm256_castsi256_ps(b.v), _mm256_castsi256_ps(a.v), m.v))};
@@ -209,14 +198,10 @@ struct Avx2Lanes {
 
 }  // namespace
 
-// 2^x for x <= 0: all lane types do the same operations in the same order, hence the same bits. Relative
-// error below 1.1e-7 (1 ulp). x below -126 counts as -126, because no kernel needs smaller results. NaN stays
-// NaN.
-//
-// x is split into n + f with n the nearest integer. A minimax polynomial of degree 6 gives 2^f on [-1/2, 1/2]
-// (relative error 2e-9), and n is added to the exponent bits.
-template <class Lanes>
-inline Lanes exp2_nonpositive(Lanes x) {
+// 2^x for x <= 0, with the same bits for all lane types and a relative error below 1.1e-7 (1 ulp). x below
+// -126 counts as -126. NaN stays NaN. x is split into the nearest integer, which is added to the exponent
+// bits, and f in [-1/2, 1/2], of which a minimax polynomial of degree 6 gives 2^f (relative error 2e-9).
+template <class Lanes> inline Lanes exp2_nonpositive(Lanes x) {
   const Lanes clamped = Lanes::max(Lanes::broadcast(-126.0f), x);
   const Lanes n = Lanes::round(clamped);
   const Lanes f = clamped - n;

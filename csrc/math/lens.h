@@ -2,19 +2,18 @@
 // Lenses that distort and shutters that roll: the pixel of a point, and its derivative. The lenses, and which
 // points are valid, are those of gsplat's main branch. All arithmetic is in double.
 //
-// A point with z <= 0 is invalid and at (0, 0). The others are at (fx u' + cx, fy v' + cy). With (u, v) =
-// (x / z, y / z) and r2 = u^2 + v^2,
+// A point with z <= 0 is invalid and at (0, 0). The others are at (fx u' + cx, fy v' + cy). With
+// (u, v) = (x / z, y / z) and r2 = u^2 + v^2,
 //   pinhole (OpenCV): s = (1 + k1 r2 + k2 r2^2 + k3 r2^3) / (1 + k4 r2 + k5 r2^2 + k6 r2^3),
 //                     u' = u s + 2 p1 u v + p2 (r2 + 2 u^2) + s1 r2 + s2 r2^2,
 //                     v' = v s + p1 (r2 + 2 v^2) + 2 p2 u v + s3 r2 + s4 r2^2, valid where s > 0.8
-//   fisheye (OpenCV): (u', v') = t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) (u, v) / |(u, v)| with t = atan
-//                     |(u, v)|, valid where t is below the lens's largest angle; t is held there
+//   fisheye (OpenCV): (u', v') = t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) (u, v) / |(u, v)| with
+//                     t = atan |(u, v)|, valid where t is below the lens's largest angle; t is held there
 // and a valid pixel also lies within `margin` image sizes of the image.
 //
 // A rolling shutter sees the first row (or column) at the time 0 and the last one at 1. The time of a point
 // is found in at most 20 steps from its pixel at the begin of the frame, or at the end where only this one is
-// valid. Unlike gsplat's, it is not rounded to that of a row: there a 2D splat only bounds what is evaluated
-// in 3D, while here the pixels of close points are subtracted, which would leave the rounding.
+// valid. Unlike gsplat's it is not rounded to that of a row, which close pixels would show.
 #pragma once
 #include "math/projection.h"
 
@@ -42,8 +41,7 @@ struct LensPose {
   }
 };
 
-template <class T>
-BLITZGS_HD LensPose load_pose(const T* m) {
+template <class T> BLITZGS_HD LensPose load_pose(const T* m) {
   return {{{m[0], m[4], m[8]}, {m[1], m[5], m[9]}, {m[2], m[6], m[10]}}, {m[3], m[7], m[11]}};
 }
 

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
-#include <limits>
 #include <random>
-#include <vector>
 
 #include "common/catch.h"
 #include "math/gaussian.h"
@@ -19,8 +17,7 @@ Values flat(const Columns3<double>& c) {
   return {c.x.x, c.x.y, c.x.z, c.y.x, c.y.y, c.y.z, c.z.x, c.z.y, c.z.z};
 }
 
-template <class T>
-Camera<T> test_camera() {
+template <class T> Camera<T> test_camera() {
   // A rotation of 30 degrees about y, then a shift.
   const T c = T(std::sqrt(0.75)), s = T(0.5);
   const T viewmat[16] = {c, 0, s, T(0.2), 0, 1, 0, T(-0.1), -s, 0, c, T(3), 0, 0, 0, 1};
@@ -181,8 +178,8 @@ float exp2_of(float x) { return blitzgs::exp2_nonpositive(Lanes::broadcast(x)).v
 TEST_CASE("2^x is accurate to an ulp for x <= 0") {
   double worst = 0;
   for (int i = 0; i <= 400000; ++i) {
-    const float x = -126.0f * static_cast<float>(i) / 400000.0f;
-    const double exact = std::exp2(static_cast<double>(x));
+    const float x = -126.0f * float(i) / 400000.0f;
+    const double exact = std::exp2(double(x));
     worst = std::max(worst, std::fabs(exp2_of(x) - exact) / exact);
   }
   REQUIRE(worst < 1.1e-7);

@@ -2,7 +2,6 @@
 // Morton (Z-order) codes: points with neighbouring codes lie close together.
 #pragma once
 #include <algorithm>
-#include <cstdint>
 
 #include "common/kernel.h"
 #ifdef __CUDACC__
@@ -18,7 +17,7 @@ struct MortonFrame {
 };
 
 // Moves bit i of the lowest 21 bits to bit 3 i.
-BLITZGS_HD std::uint64_t spread_bits(std::uint64_t x) {
+BLITZGS_HD uint64_t spread_bits(uint64_t x) {
   x &= 0x1fffff;
   x = (x | x << 32) & 0x1f00000000ffffULL;
   x = (x | x << 16) & 0x1f0000ff0000ffULL;
@@ -28,26 +27,23 @@ BLITZGS_HD std::uint64_t spread_bits(std::uint64_t x) {
   return x;
 }
 
-template <class T>
-BLITZGS_HD bool is_finite_point(const T* p) {
+template <class T> BLITZGS_HD bool is_finite_point(const T* p) {
   const T sum = p[0] * T(0) + p[1] * T(0) + p[2] * T(0);
   return sum == T(0);
 }
 
 // The code of a point. A point that is not finite gets all ones, so that it sorts last.
-template <class T>
-BLITZGS_HD std::uint64_t morton_code(const T* p, const MortonFrame& frame) {
-  if (!is_finite_point(p)) return ~std::uint64_t{0};
-  std::uint64_t code = 0;
+template <class T> BLITZGS_HD uint64_t morton_code(const T* p, const MortonFrame& frame) {
+  if (!is_finite_point(p)) return ~uint64_t{0};
+  uint64_t code = 0;
   for (int axis = 0; axis < 3; ++axis) {
-    const double cell = (static_cast<double>(p[axis]) - frame.low[axis]) * frame.cells_per_unit;
+    const double cell = (double(p[axis]) - frame.low[axis]) * frame.cells_per_unit;
     const double clamped = cell > 0 ? (cell < 2097151.0 ? cell : 2097151.0) : 0.0;
-    code |= spread_bits(static_cast<std::uint64_t>(clamped)) << axis;
+    code |= spread_bits(uint64_t(clamped)) << axis;
   }
   return code;
 }
 
-// The frame of a cloud from the corners of its bounding box.
 BLITZGS_HD MortonFrame make_morton_frame(const double* low, const double* high) {
   MortonFrame frame{{low[0], low[1], low[2]}, 0.0};
   double extent = 0;
@@ -59,11 +55,10 @@ BLITZGS_HD MortonFrame make_morton_frame(const double* low, const double* high) 
 }
 
 // The frame of all finite points, on the host.
-template <class T>
-MortonFrame morton_frame_of(const T* points, std::int64_t n) {
+template <class T> MortonFrame morton_frame_of(const T* points, int64_t n) {
   double low[3] = {0, 0, 0}, high[3] = {0, 0, 0};
   bool first = true;
-  for (std::int64_t i = 0; i < n; ++i) {
+  for (int64_t i = 0; i < n; ++i) {
     const T* p = points + 3 * i;
     if (!is_finite_point(p)) continue;
     for (int axis = 0; axis < 3; ++axis) {
@@ -79,22 +74,21 @@ MortonFrame morton_frame_of(const T* points, std::int64_t n) {
 }  // namespace blitzgs
 
 #ifdef __CUDACC__
-// The Morton frame of a cloud of points, computed on the GPU so that the host need not wait for
-// it.
+// The Morton frame of a cloud of points, computed on the GPU: the host need not wait.
 namespace blitzgs::cuda {
 
 // Maps floats to integers of the same order, so that atomicMin and atomicMax find the bounds of the cloud.
-__device__ inline std::int32_t ordered(float x) {
-  const std::int32_t bits = __float_as_int(x);
+__device__ inline int32_t ordered(float x) {
+  const int32_t bits = __float_as_int(x);
   return bits < 0 ? bits ^ 0x7fffffff : bits;
 }
-__device__ inline float unordered(std::int32_t bits) {
+__device__ inline float unordered(int32_t bits) {
   return __int_as_float(bits < 0 ? bits ^ 0x7fffffff : bits);
 }
 
 struct MortonBounds {
-  std::int32_t low[3], high[3];
-  std::int32_t finite;  // number of finite points
+  int32_t low[3], high[3];
+  int32_t finite;  // number of finite points
 };
 
 // Sets the bounds to those of no points. One warp.
@@ -104,13 +98,11 @@ static __global__ void reset_bounds(MortonBounds* bounds) {
   if (axis == 3) bounds->finite = 0;
 }
 
-// Finds the bounding box and the number of the finite points of points [n, 3]. One thread per point, in a
-// grid-stride loop.
-static __global__ void find_bounds(const float* points, std::int64_t n, MortonBounds* bounds) {
-  std::int32_t low[3] = {INT32_MAX, INT32_MAX, INT32_MAX}, high[3] = {INT32_MIN, INT32_MIN, INT32_MIN},
-               finite = 0;
-  for (std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x; i < n;
-       i += std::int64_t{gridDim.x} * blockDim.x) {
+// Finds the bounding box and the number of the finite points of points [n, 3]. A thread per point, in a loop.
+static __global__ void find_bounds(const float* points, int64_t n, MortonBounds* bounds) {
+  int32_t low[3] = {INT32_MAX, INT32_MAX, INT32_MAX}, high[3] = {INT32_MIN, INT32_MIN, INT32_MIN}, finite = 0;
+  for (int64_t i = blockIdx.x * int64_t{blockDim.x} + threadIdx.x; i < n;
+       i += int64_t{gridDim.x} * blockDim.x) {
     const float* p = points + 3 * i;
     if (!is_finite_point(p)) continue;
     ++finite;
@@ -121,8 +113,7 @@ static __global__ void find_bounds(const float* points, std::int64_t n, MortonBo
   }
   finite = __reduce_add_sync(kFullWarp, finite);
   for (int axis = 0; axis < 3; ++axis) {
-    const std::int32_t l = __reduce_min_sync(kFullWarp, low[axis]),
-                       h = __reduce_max_sync(kFullWarp, high[axis]);
+    const int32_t l = __reduce_min_sync(kFullWarp, low[axis]), h = __reduce_max_sync(kFullWarp, high[axis]);
     if (threadIdx.x % 32 == 0) {
       atomicMin(&bounds->low[axis], l);
       atomicMax(&bounds->high[axis], h);
@@ -140,7 +131,7 @@ __device__ inline MortonFrame frame_of(const MortonBounds& bounds) {
   return make_morton_frame(low, high);
 }
 
-inline MortonBounds* find_morton_bounds(const float* points, std::int64_t n, Workspace& workspace,
+inline MortonBounds* find_morton_bounds(const float* points, int64_t n, Workspace& workspace,
                                         cudaStream_t stream) {
   MortonBounds* bounds = workspace.allocate<MortonBounds>(1);
   reset_bounds<<<1, 32, 0, stream>>>(bounds);

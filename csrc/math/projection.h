@@ -9,29 +9,23 @@
 // determinant |m0 x m1|^2 + eps tr(M M^T) + eps^2 is then a sum of non-negative terms, while the usual
 // ac - b^2 cancels for elongated splats.
 #pragma once
-#include <cmath>
-#include <limits>
-
 #include "math/gaussian.h"
 
 namespace blitzgs {
 
 // A pinhole camera: the rows of the world-to-camera rotation, the camera centre, and the slopes x/z and y/z
 // at which the Jacobian is clamped.
-template <class T>
-struct Camera {
+template <class T> struct Camera {
   Vec3<T> row_x, row_y, row_z, translation, centre;
   T fx, fy, cx, cy;
   T slope_min_x, slope_max_x, slope_min_y, slope_max_y;
 };
 
 // viewmat [4, 4] and K [3, 3] row-major. The slopes leave 0.15 of the image size beyond each border, which is
-// 1.3 tan(fov / 2) for a centred principal point. The centre assumes a rotation: c = -W^T t. A skew, or
-// another last row of K than 0, 0, 1, beyond rounding has no place in the projection: such a camera sees
-// nothing, as one that is not finite. Whoever finds the view empty looks at its camera, which costs the
-// others no look.
-template <class T>
-BLITZGS_HD Camera<T> make_camera(const T* viewmat, const T* K, int width, int height) {
+// 1.3 tan(fov / 2) for a centred principal point. The centre assumes a rotation: c = -W^T t. A camera with a
+// skew, or another last row of K than 0, 0, 1, has no place in the projection: beyond rounding, it sees
+// nothing, as one that is not finite.
+template <class T> BLITZGS_HD Camera<T> make_camera(const T* viewmat, const T* K, int width, int height) {
   Camera<T> camera;
   camera.row_x = load3(viewmat);
   camera.row_y = load3(viewmat + 4);
@@ -60,15 +54,13 @@ struct ProjectedMean {
   double slope_x, slope_y, z, inverse_z;  // x/z, y/z, camera-space depth
 };
 
-template <class T>
-BLITZGS_HD double row_times_point(const Vec3<T>& row, const Vec3<T>& point, T offset) {
+template <class T> BLITZGS_HD double row_times_point(const Vec3<T>& row, const Vec3<T>& point, T offset) {
   return mul_add(double(row.z), double(point.z),
                  mul_add(double(row.y), double(point.y), double(row.x) * double(point.x))) +
          double(offset);
 }
 
-template <class T>
-BLITZGS_HD ProjectedMean project_mean(const Camera<T>& camera, const Vec3<T>& mean) {
+template <class T> BLITZGS_HD ProjectedMean project_mean(const Camera<T>& camera, const Vec3<T>& mean) {
   const double x = row_times_point(camera.row_x, mean, camera.translation.x);
   const double y = row_times_point(camera.row_y, mean, camera.translation.y);
   const double z = row_times_point(camera.row_z, mean, camera.translation.z);
@@ -83,8 +75,7 @@ BLITZGS_HD void pixel_position(const Camera<T>& camera, const ProjectedMean& p, 
 }
 
 // Rows of J W: the derivative of the pixel position by the world-space position, at the clamped slopes.
-template <class T>
-struct PixelGradients {
+template <class T> struct PixelGradients {
   Vec3<T> gx, gy;
   T u, v, inverse_z;
   bool u_free, v_free;  // not clamped
@@ -106,8 +97,7 @@ BLITZGS_HD PixelGradients<T> pixel_gradients(const Camera<T>& camera, const Proj
 
 // The footprint of a Gaussian in the image: the rows of M, and of the blurred covariance Sigma' the diagonal,
 // the inverse (conic a, b, c) and the determinant.
-template <class T>
-struct Footprint {
+template <class T> struct Footprint {
   Vec3<T> m0, m1;
   T cov_xx, cov_yy;
   T conic[3];
@@ -143,13 +133,11 @@ BLITZGS_HD Footprint<T> make_footprint(const PixelGradients<T>& g, const Columns
   return s;
 }
 
-// Writes the conic (a, b, c) to conic [3]. The length of a splat along its axis depends on ac - b^2. Rounding
-// a, b and c to float changes that difference by up to ac / (ac - b^2) roundings, which is 1e-3 of it for a
-// splat that is a hundred times longer than wide. The function therefore tries floats next to a, scales b
-// with a (the axis has the direction (-b, a)), and keeps the pair for which some float c gives the best
-// determinant.
-template <class T>
-BLITZGS_HD void store_conic(const Footprint<T>& s, T* conic) {
+// Writes the conic (a, b, c) to conic [3]. The length of a splat depends on ac - b^2, which rounding to float
+// changes by up to ac / (ac - b^2) roundings: 1e-3 for a splat a hundred times longer than wide. The function
+// therefore tries floats next to a, scales b with a (the axis has the direction (-b, a)), and keeps the pair
+// for which some float c gives the best determinant.
+template <class T> BLITZGS_HD void store_conic(const Footprint<T>& s, T* conic) {
   for (int i = 0; i < 3; ++i) conic[i] = s.conic[i];
   if constexpr (sizeof(T) == sizeof(float)) {
     constexpr T kLong = 64;  // ac / (ac - b^2)
@@ -174,10 +162,7 @@ BLITZGS_HD void store_conic(const Footprint<T>& s, T* conic) {
 }
 
 // In antialiased mode, the factor by which the blur lowers the peak of a splat.
-template <class T>
-BLITZGS_HD T compensation(const Footprint<T>& s) {
-  return s.normal_length / s.root_det;
-}
+template <class T> BLITZGS_HD T compensation(const Footprint<T>& s) { return s.normal_length / s.root_det; }
 
 // Gradients of the rows of M from those of the conic (b counted once) and of the compensation. With Q the
 // conic matrix, d(Sigma'^-1) = -Q dSigma' Q, so the conic's part is v_M = -2 Q V Q M. As a matrix product,
@@ -216,8 +201,7 @@ BLITZGS_HD void factor_vjp(const PixelGradients<T>& g, const Columns3<T>& axes, 
 }
 
 // Gradients with respect to a camera's pose, summed over Gaussians.
-template <class T>
-struct PoseGradient {
+template <class T> struct PoseGradient {
   Vec3<T> row_x, row_y, row_z, translation;
 };
 

@@ -1,25 +1,20 @@
 // SPDX-License-Identifier: Apache-2.0
-// The test of which tiles a splat touches (docs/image.md, section 3). The projection counts tiles by it and
-// the intersection lists them by it, on every backend.
+// The test of which tiles a splat touches (docs/image.md, section 3): the projection counts tiles by it and
+// the intersection lists them, on every backend.
 //
 // A splat is composited where opacity * exp(-q/2) >= 1/255 with q = a dx^2 + 2 b dx dy + c dy^2, that is
-// inside the ellipse q <= 2 ln(255 opacity). Consider the band of pixel centres of one row of tiles. The part
-// of the ellipse in this band spans an interval of x, whose ends have a closed form: the interval is widest
-// at the turning point of the ellipse, clamped to the band. The splat touches the tiles of the row with a
-// pixel column in this interval. The cost is O(tile rows).
+// inside the ellipse q <= 2 ln(255 opacity). Its part in the band of pixel centres of one row of tiles spans
+// an interval of x, whose ends have a closed form: the turning point of the ellipse, clamped to the band. The
+// splat touches the tiles of the row with a pixel column in this interval. The cost is O(tile rows).
 //
 // The test is conservative: the ellipse is enlarged by a relative and absolute 2e-5 in q, and the interval by
-// some float roundings. This covers the rounding of the test itself and of the rasterisers, which evaluate q
-// as factor_conic() writes it. A tile that is not listed therefore gets no contribution from the splat. A
-// splat that is not finite, not convex (a <= 0 or c <= 0) or too faint (opacity < 1/255) touches no tile.
+// some float roundings. This covers the rounding of the test and of the rasterisers, which evaluate q as
+// factor_conic() writes it. A splat that is not finite, not convex (a <= 0 or c <= 0) or too faint
+// (opacity < 1/255) touches no tile.
 //
-// Every kernel must count the same tiles, because the count of one kernel is the buffer size of another. The
-// expressions here therefore use mul() and mul_add(), which the compiler cannot contract differently.
+// The count of one kernel is the buffer size of another, so the expressions here use mul() and mul_add(),
+// which no compiler contracts differently.
 #pragma once
-#include <cmath>
-#include <cstdint>
-
-#include "common/kernel.h"
 #include "math/vec.h"
 
 namespace blitzgs {
@@ -32,15 +27,15 @@ constexpr double kMinTransmittance = 1e-4;  // a pixel ends before its transmitt
 // [tile_begin, tile_end) are owned: the others are not listed, and their pixels are zero.
 struct TileGrid {
   int n_cameras, width, height, tile_size, tiles_x, tiles_y;
-  std::int64_t tile_begin, tile_end;
+  int64_t tile_begin, tile_end;
 
-  BLITZGS_HD std::int64_t per_image() const { return static_cast<std::int64_t>(tiles_x) * tiles_y; }
-  BLITZGS_HD std::int64_t count() const { return n_cameras * per_image(); }
+  BLITZGS_HD int64_t per_image() const { return int64_t(tiles_x) * tiles_y; }
+  BLITZGS_HD int64_t count() const { return n_cameras * per_image(); }
 };
 
 // tile_end < 0 means all tiles.
-BLITZGS_HD TileGrid make_tile_grid(int n_cameras, int width, int height, int tile_size,
-                                   std::int64_t tile_begin, std::int64_t tile_end) {
+BLITZGS_HD TileGrid make_tile_grid(int n_cameras, int width, int height, int tile_size, int64_t tile_begin,
+                                   int64_t tile_end) {
   const int tiles_x = (width + tile_size - 1) / tile_size;
   const int tiles_y = (height + tile_size - 1) / tile_size;
   TileGrid grid{n_cameras, width, height, tile_size, tiles_x, tiles_y, tile_begin, tile_end};
@@ -48,23 +43,19 @@ BLITZGS_HD TileGrid make_tile_grid(int n_cameras, int width, int height, int til
   return grid;
 }
 
-namespace tiles {
-
 // Clamp a value; NaN becomes the lower bound in the first and the upper bound in the second.
-template <class T>
-BLITZGS_HD T clamp_nan_low(T value, T low, T high) {
+template <class T> BLITZGS_HD T clamp_nan_low(T value, T low, T high) {
   return value > low ? (value < high ? value : high) : low;
 }
-template <class T>
-BLITZGS_HD T clamp_nan_high(T value, T low, T high) {
+template <class T> BLITZGS_HD T clamp_nan_high(T value, T low, T high) {
   return value < high ? (value > low ? value : low) : high;
 }
 
 // x / size for x >= 0. If the size is a power of two, as tile sizes usually are, the division is a shift.
-struct Divider {
+struct TileDivider {
   int size, shift;
 
-  BLITZGS_HD explicit Divider(int tile_size) : size(tile_size), shift(-1) {
+  BLITZGS_HD explicit TileDivider(int tile_size) : size(tile_size), shift(-1) {
     if ((tile_size & (tile_size - 1)) == 0) {
       for (shift = 0; (1 << shift) < tile_size;) ++shift;
     }
@@ -72,41 +63,34 @@ struct Divider {
   BLITZGS_HD int operator()(int x) const { return shift >= 0 ? x >> shift : x / size; }
 };
 
-}  // namespace tiles
-
-// The factor L of conic = L^T L, so q = (l11 dx + l21 dy)^2 + (l22 dy)^2. This form is never negative, and it
-// is free of the cancellation in a dx^2 + 2 b dx dy + c dy^2 for thin splats. A conic that rounding made
-// indefinite gets l22 = 0: a splat that is so long is constant along its axis. The products of floats are
-// exact in double.
-template <class T>
-struct ConicFactor {
+// The factor L of conic = L^T L, so q = (l11 dx + l21 dy)^2 + (l22 dy)^2, which is never negative and does
+// not cancel for thin splats. A conic that rounding made indefinite gets l22 = 0: a splat that is so long is
+// constant along its axis. The products of floats are exact in double.
+template <class T> struct ConicFactor {
   T l11, l21, l22;
 };
 
-template <class T>
-BLITZGS_HD double conic_determinant(const T* conic) {
-  const double b = static_cast<double>(conic[1]);
+template <class T> BLITZGS_HD double conic_determinant(const T* conic) {
+  const double b = double(conic[1]);
   const double bb = b * b;
 #ifdef __CUDA_ARCH__
-  const double det = fma(static_cast<double>(conic[0]), static_cast<double>(conic[2]), -bb);
+  const double det = fma(double(conic[0]), double(conic[2]), -bb);
 #else
-  const double det = static_cast<double>(conic[0]) * static_cast<double>(conic[2]) - bb;
+  const double det = double(conic[0]) * double(conic[2]) - bb;
 #endif
   return det > 0.0 ? det : 0.0;
 }
 
-template <class T>
-BLITZGS_HD ConicFactor<T> factor_conic(const T* conic) {
+template <class T> BLITZGS_HD ConicFactor<T> factor_conic(const T* conic) {
   ConicFactor<T> factor;
   factor.l11 = std::sqrt(conic[0]);
   factor.l21 = conic[1] / factor.l11;
-  factor.l22 = std::sqrt(static_cast<T>(conic_determinant(conic) / static_cast<double>(conic[0])));
+  factor.l22 = std::sqrt(T(conic_determinant(conic) / double(conic[0])));
   return factor;
 }
 
 // The enlarged ellipse of a splat relative to its mean.
-template <class T>
-struct SplatEllipse {
+template <class T> struct SplatEllipse {
   T cut;      // q <= cut
   T shear;    // the row at height dy meets the ellipse in a chord that is centred on dx = -shear * dy
   T inv_l11;  // half the length of this chord is sqrt(cut - (l22 dy)^2) * inv_l11
@@ -116,40 +100,36 @@ struct SplatEllipse {
 };
 
 // Returns false if the splat touches no pixel.
-template <class T>
-BLITZGS_HD bool make_ellipse(const T* conic, T opacity, SplatEllipse<T>* ellipse) {
+template <class T> BLITZGS_HD bool make_ellipse(const T* conic, T opacity, SplatEllipse<T>* ellipse) {
   const T a = conic[0], b = conic[1], c = conic[2];
-  if (!(opacity >= static_cast<T>(kAlphaCut)) || !is_finite(opacity)) return false;
+  if (!(opacity >= T(kAlphaCut)) || !is_finite(opacity)) return false;
   if (!(a > T(0)) || !(c > T(0)) || !is_finite(a) || !is_finite(b) || !is_finite(c)) return false;
   const T exact = T(2) * std::log(T(255) * opacity);
   ellipse->cut = mul_add(exact > T(0) ? exact : T(0), T(1.00002), T(2e-5));
   const ConicFactor<T> factor = factor_conic(conic);
   if (!(factor.l11 > T(0))) return false;
-  // One division serves a / det and c / det, because a division in double costs as much as the rest of this
-  // function.
+  // One division serves both, because one in double costs as much as the rest of this function.
   const double det = conic_determinant(conic);
   const double inverse = 1.0 / det;
   ellipse->inv_l11 = T(1) / factor.l11;
   ellipse->shear = b / a;
   ellipse->l22 = factor.l22;
-  ellipse->half_height = std::sqrt(mul(ellipse->cut, static_cast<T>(static_cast<double>(a) * inverse)));
-  ellipse->half_width = std::sqrt(mul(ellipse->cut, static_cast<T>(static_cast<double>(c) * inverse)));
+  ellipse->half_height = std::sqrt(mul(ellipse->cut, T(double(a) * inverse)));
+  ellipse->half_width = std::sqrt(mul(ellipse->cut, T(double(c) * inverse)));
   ellipse->turn = b == T(0) ? T(0) : -(b / c) * ellipse->half_width;
   return is_finite(ellipse->shear) && is_finite(ellipse->inv_l11);
 }
 
 // Sets the first and last index of the pixel centres i + 0.5 in [low, high], within [0, size); first > last
 // if there is none. A bound that is NaN is ignored.
-template <class T>
-BLITZGS_HD void pixels_between(T low, T high, int size, int* first, int* last) {
-  *first = static_cast<int>(std::ceil(tiles::clamp_nan_low(low - T(0.5), T(0), static_cast<T>(size))));
-  *last = static_cast<int>(std::floor(tiles::clamp_nan_high(high - T(0.5), T(-1), static_cast<T>(size - 1))));
+template <class T> BLITZGS_HD void pixels_between(T low, T high, int size, int* first, int* last) {
+  *first = int(std::ceil(clamp_nan_low(low - T(0.5), T(0), T(size))));
+  *last = int(std::floor(clamp_nan_high(high - T(0.5), T(-1), T(size - 1))));
 }
 
 // Returns x at one end of the ellipse's interval over a band of rows. side is -1 for the left end and 1 for
 // the right one; dy is the height within the band at which that end lies furthest out.
-template <class T>
-BLITZGS_HD T chord_end(const SplatEllipse<T>& e, T x, T y, T dy, T side) {
+template <class T> BLITZGS_HD T chord_end(const SplatEllipse<T>& e, T x, T y, T dy, T side) {
   constexpr T kRounding = sizeof(T) == 4 ? T(1e-6) : T(1e-14);
   const T w = e.l22 * dy;
   const T rest = mul_add(-w, w, e.cut);
@@ -163,22 +143,20 @@ BLITZGS_HD T chord_end(const SplatEllipse<T>& e, T x, T y, T dy, T side) {
 }
 
 // The tile rows that a splat's ellipse may reach, and the interval of tiles in each of them.
-template <class T>
-struct TileRows {
+template <class T> struct TileRows {
   SplatEllipse<T> ellipse;
   T x, y;                   // the splat's mean
   int row_first, row_last;  // pixel rows
   int first, last;          // tile rows; first > last if there is none
 
-  // Sets the tiles [*begin, *end) that the splat touches in tile row ty, from first to last. Returns false if
-  // there is none.
-  BLITZGS_HD bool interval(int ty, int width, const tiles::Divider& tile_of, int* begin, int* end) const {
+  // Sets the tiles [*begin, *end) that the splat touches in tile row ty, from first to last; false: none.
+  BLITZGS_HD bool interval(int ty, int width, const TileDivider& tile_of, int* begin, int* end) const {
     const int top = ty * tile_of.size, bottom = top + tile_of.size - 1;
     const int band_first = row_first > top ? row_first : top,
               band_last = row_last < bottom ? row_last : bottom;
-    const T low = static_cast<T>(band_first) + T(0.5) - y, high = static_cast<T>(band_last) + T(0.5) - y;
-    const T left = chord_end(ellipse, x, y, tiles::clamp_nan_low(-ellipse.turn, low, high), T(-1));
-    const T right = chord_end(ellipse, x, y, tiles::clamp_nan_low(ellipse.turn, low, high), T(1));
+    const T low = T(band_first) + T(0.5) - y, high = T(band_last) + T(0.5) - y;
+    const T left = chord_end(ellipse, x, y, clamp_nan_low(-ellipse.turn, low, high), T(-1));
+    const T right = chord_end(ellipse, x, y, clamp_nan_low(ellipse.turn, low, high), T(1));
     int column_first, column_last;
     pixels_between(left, right, width, &column_first, &column_last);
     *begin = tile_of(column_first);
@@ -189,7 +167,7 @@ struct TileRows {
 
 template <class T>
 BLITZGS_HD TileRows<T> find_tile_rows(const T* mean2d, const T* conic, T opacity, int height,
-                                      const tiles::Divider& tile_of) {
+                                      const TileDivider& tile_of) {
   constexpr T kRounding = sizeof(T) == 4 ? T(1e-6) : T(1e-14);
   TileRows<T> rows{};
   rows.last = -1;
@@ -209,7 +187,7 @@ BLITZGS_HD TileRows<T> find_tile_rows(const T* mean2d, const T* conic, T opacity
 template <class T, class F>
 BLITZGS_HD void for_each_tile_row(const T* mean2d, const T* conic, T opacity, int width, int height,
                                   int tile_size, const F& f) {
-  const tiles::Divider tile_of(tile_size);
+  const TileDivider tile_of(tile_size);
   const TileRows<T> rows = find_tile_rows(mean2d, conic, opacity, height, tile_of);
   for (int ty = rows.first; ty <= rows.last; ++ty) {
     int begin, end;
@@ -220,16 +198,16 @@ BLITZGS_HD void for_each_tile_row(const T* mean2d, const T* conic, T opacity, in
 // The tiles of each rank: rank m composites the flattened tiles [begin[m], end[m]) of all cameras. Ranges may
 // be empty and may overlap; their begins ascend.
 struct RankTiles {
-  std::int64_t begin[kMaxRanks], end[kMaxRanks];
+  int64_t begin[kMaxRanks], end[kMaxRanks];
   int n_ranks;
 };
 
 // Calls f(rank, tiles) for each rank that composites some of the tiles [begin, end).
 template <class F>
-BLITZGS_HD void for_each_rank(const RankTiles& ranks, std::int64_t begin, std::int64_t end, const F& f) {
+BLITZGS_HD void for_each_rank(const RankTiles& ranks, int64_t begin, int64_t end, const F& f) {
   for (int m = 0; m < ranks.n_ranks && ranks.begin[m] < end; ++m) {
-    const std::int64_t low = ranks.begin[m] > begin ? ranks.begin[m] : begin;
-    const std::int64_t high = ranks.end[m] < end ? ranks.end[m] : end;
+    const int64_t low = ranks.begin[m] > begin ? ranks.begin[m] : begin;
+    const int64_t high = ranks.end[m] < end ? ranks.end[m] : end;
     if (low < high) f(m, high - low);
   }
 }

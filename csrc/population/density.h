@@ -1,11 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Density control: statistics of the gradients, the features of candidates, and the trees that score them.
 #pragma once
-#include <cmath>
-#include <cstdint>
-#include <limits>
-
-#include "common/kernel.h"
 #include "math/gaussian.h"
 #include "math/tiles.h"
 
@@ -29,41 +24,37 @@ namespace blitzgs {
 // is not positive. In double, because the determinant of a thin splat's conic is a small difference. If that
 // is less than the rounding of the conic's own numbers, the rounding takes its place: the splat is then at
 // least so long, and not mistaken for a small one.
-template <class T>
-BLITZGS_HD T three_sigma_radius(const T* conic) {
+template <class T> BLITZGS_HD T three_sigma_radius(const T* conic) {
   constexpr double kRounding = std::numeric_limits<T>::epsilon();
-  const double a = static_cast<double>(conic[0]), c = static_cast<double>(conic[2]);
+  const double a = double(conic[0]), c = double(conic[2]);
   if (!(a > 0 && c > 0)) return 0;
   const double found = conic_determinant(conic), least = kRounding * a * c;
   const double determinant = found > least ? found : least;
   const double half_trace = 0.5 * (a + c) / determinant;
   const double gap = half_trace * half_trace - 1 / determinant;
-  return static_cast<T>(std::ceil(3 * std::sqrt(half_trace + std::sqrt(gap > 0.1 ? gap : 0.1))));
+  return T(std::ceil(3 * std::sqrt(half_trace + std::sqrt(gap > 0.1 ? gap : 0.1))));
 }
 
-template <class T>
-struct DensityStats {
-  T* grad_sum;               // [N]
-  std::int32_t* grad_count;  // [N]
-  T* max_radii;              // [N]
-  const std::int32_t* visible_ids;
-  const std::int32_t* splat_offsets;
+template <class T> struct DensityStats {
+  T* grad_sum;          // [N]
+  int32_t* grad_count;  // [N]
+  T* max_radii;         // [N]
+  const int32_t *visible_ids, *splat_offsets;
   const T* v_means2d;
-  std::int64_t v_stride;
-  const T* conics;
-  const T* phi;
-  std::int64_t n;
+  int64_t v_stride;
+  const T *conics, *phi;
+  int64_t n;
   T half_width, half_height, weight;
 
-  BLITZGS_HD void operator()(std::int64_t u) const {
-    const std::int32_t id = visible_ids[u];
-    const std::int32_t begin = splat_offsets[u], end = splat_offsets[u + 1];
+  BLITZGS_HD void operator()(int64_t u) const {
+    const int32_t id = visible_ids[u];
+    const int32_t begin = splat_offsets[u], end = splat_offsets[u + 1];
     T sum = 0, radius = max_radii[id];
-    for (std::int32_t r = begin; r < end; ++r) {
+    for (int32_t r = begin; r < end; ++r) {
       const T* v = v_means2d + r * v_stride;
       const T x = v[0] * half_width, y = v[1] * half_height;
       sum += std::sqrt(x * x + y * y);
-      const T reach = three_sigma_radius(conics + 3 * std::int64_t{r});
+      const T reach = three_sigma_radius(conics + 3 * int64_t{r});
       radius = reach > radius ? reach : radius;
     }
     grad_sum[id] += (phi ? phi[id] : T(1)) * weight * sum;
@@ -74,29 +65,28 @@ struct DensityStats {
 
 // The features of candidates of densification, from which the spawn gate predicts whether their children
 // survive (BlitzGS, section 3.2). The features are those of blitzgs.spawn.candidates.FEATURES. Each is
-// computed in float64 and rounded once, so that CPU and CUDA agree but for rare differences in the last bit.
-// The cost is O(M).
+// computed in float64 and rounded once, so that CPU and CUDA rarely differ, in the last bit. O(M).
 
 constexpr int kSpawnFeatures = 10;
 
 struct SpawnFeatures {
-  const float* grad_sum;           // [N], sum of gradient norms since the last density event
-  const std::int32_t* grad_count;  // [N], number of these gradients
-  const float* opacities;          // [N], logits
-  const float* scales;             // [N, 3], logarithms
-  const std::int32_t* birth;       // [N], in images
-  const std::uint8_t* level;       // [N], octree level
-  const float* color_moments;      // [N, K, 3], Adam's mean squared gradients of the SH coefficients
-  std::int64_t color_stride;       // 3 K
-  const std::int64_t* rows;        // [M], in [0, N)
-  const bool* is_split;            // [M]
-  std::int64_t n, time;            // time: of the event, in images
-  double extent;                   // of the scene
+  const float* grad_sum;       // [N], sum of gradient norms since the last density event
+  const int32_t* grad_count;   // [N], number of these gradients
+  const float* opacities;      // [N], logits
+  const float* scales;         // [N, 3], logarithms
+  const int32_t* birth;        // [N], in images
+  const uint8_t* level;        // [N], octree level
+  const float* color_moments;  // [N, K, 3], Adam's mean squared gradients of the SH coefficients
+  int64_t color_stride;        // 3 K
+  const int64_t* rows;         // [M], in [0, N)
+  const bool* is_split;        // [M]
+  int64_t n, time;             // time: of the event, in images
+  double extent;               // of the scene
   int level_count;
   float* features;  // [M, kSpawnFeatures]
 
-  BLITZGS_HD void operator()(std::int64_t candidate) const {
-    const std::int64_t row = rows[candidate];
+  BLITZGS_HD void operator()(int64_t candidate) const {
+    const int64_t row = rows[candidate];
     const int views = grad_count[row], own_level = level[row];
     const float* const log_scale = scales + 3 * row;
     const double x = log_scale[0], y = log_scale[1], z = log_scale[2];
@@ -104,16 +94,16 @@ struct SpawnFeatures {
     const double color = (double{moments[0]} + moments[1] + moments[2]) / 3;
     const bool splits = is_split[candidate];
     float* const out = features + kSpawnFeatures * candidate;
-    out[0] = grad_sum[row] / static_cast<float>(views > 1 ? views : 1);
-    out[1] = static_cast<float>(sigmoid(static_cast<double>(opacities[row])));
-    out[2] = static_cast<float>((std::exp(x) + std::exp(y) + std::exp(z)) / 3 / extent);
-    out[3] = static_cast<float>(time - birth[row]);
-    out[4] = static_cast<float>(views);
-    out[5] = static_cast<float>(splits ? smaller(own_level + 1, level_count - 1) : own_level);
-    out[6] = static_cast<float>(time);
+    out[0] = grad_sum[row] / float(views > 1 ? views : 1);
+    out[1] = float(sigmoid(double(opacities[row])));
+    out[2] = float((std::exp(x) + std::exp(y) + std::exp(z)) / 3 / extent);
+    out[3] = float(time - birth[row]);
+    out[4] = float(views);
+    out[5] = float(splits ? smaller(own_level + 1, level_count - 1) : own_level);
+    out[6] = float(time);
     out[7] = splits;
-    out[8] = static_cast<float>(std::sqrt(color));
-    out[9] = static_cast<float>(std::exp(smaller(x, smaller(y, z)) - larger(x, larger(y, z))));
+    out[8] = float(std::sqrt(color));
+    out[9] = float(std::exp(smaller(x, smaller(y, z)) - larger(x, larger(y, z))));
   }
 };
 
@@ -129,26 +119,25 @@ struct SpawnFeatures {
 
 struct alignas(16) TreeNode {
   float threshold;
-  std::int32_t feature;      // twice the index of the feature, plus 1 if NaN goes left
-  std::int32_t left, right;  // -1 for a leaf
+  int32_t feature;      // twice the index of the feature, plus 1 if NaN goes left
+  int32_t left, right;  // -1 for a leaf
 };
 
 struct TreeSumsArgs {
   const float* features;
-  const std::int32_t* roots;
+  const int32_t* roots;
   const TreeNode* nodes;
-  const std::int64_t* leaves;
-  std::int64_t n_rows, n_features;
+  const int64_t* leaves;
+  int64_t n_rows, n_features;
   int n_trees, depth;
-  std::int64_t* sums;
+  int64_t* sums;
 };
 
 // The sum for one row; row[i] is its feature i.
-template <class Row>
-BLITZGS_HD std::int64_t tree_sum_of(const TreeSumsArgs& args, const Row& row) {
-  std::int64_t sum = 0;
+template <class Row> BLITZGS_HD int64_t tree_sum_of(const TreeSumsArgs& args, const Row& row) {
+  int64_t sum = 0;
   for (int tree = 0; tree < args.n_trees; ++tree) {
-    std::int32_t at = args.roots[tree];
+    int32_t at = args.roots[tree];
     for (int step = 0; step < args.depth; ++step) {
       const TreeNode node = args.nodes[at];
       if (node.left < 0) break;

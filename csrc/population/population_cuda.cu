@@ -1,5 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-
 #include <cub/cub.cuh>
 
 #include "common/cuda.cuh"
@@ -12,7 +11,6 @@
 #include "population/relocation.h"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 constexpr int kThreads = 256, kBlocks = 512;
@@ -22,26 +20,25 @@ __global__ void __launch_bounds__(kThreads)
     check_columns_kernel(const __grid_constant__ CheckedColumns<float> checked) {
   const auto& column = checked.columns[blockIdx.y];
   bool bad = false;
-  for (std::int64_t i = blockIdx.x * std::int64_t{kThreads} + threadIdx.x; i < column.length;
-       i += gridDim.x * std::int64_t{kThreads}) {
+  for (int64_t i = blockIdx.x * int64_t{kThreads} + threadIdx.x; i < column.length;
+       i += gridDim.x * int64_t{kThreads}) {
     bad |= is_bad(column.values[i], column.zero_is_bad);
   }
   if (bad) *checked.bad = 1;
 }
 
-// A row of features in shared memory. Feature i of all threads is contiguous, so lanes have no bank
-// conflicts.
+// A row of features in shared memory. One feature is contiguous, without bank conflicts.
 struct StridedRow {
   const float* first;
   __device__ float operator[](int feature) const { return first[feature * kThreads]; }
 };
 
-// sums [M] (density.h), one thread per row. All threads of a block take the same tree at a time, so that
-// its nodes stay in the L1 cache.
+// sums [M] (density.h), one thread per row. All threads of a block take the same tree at a time, so that its
+// nodes stay in the L1 cache.
 __global__ void __launch_bounds__(kThreads) tree_sums_kernel(const TreeSumsArgs args) {
   extern __shared__ float shared[];
   wait_for_earlier_kernels();
-  const std::int64_t row = static_cast<std::int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+  const int64_t row = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (row >= args.n_rows) return;
   float* const row_features = shared + threadIdx.x;
   const float* const features = args.features + row * args.n_features;
@@ -51,12 +48,12 @@ __global__ void __launch_bounds__(kThreads) tree_sums_kernel(const TreeSumsArgs 
 
 // out (columns.h). A block copies kThreads rows, a thread one word at a time. units: the words in a row.
 template <class Word>
-__global__ void __launch_bounds__(kThreads) copy_rows_kernel(const CopyRows copy, std::uint32_t units) {
-  __shared__ std::int64_t from[kThreads], to[kThreads];
-  const std::int64_t first = blockIdx.x * std::int64_t{kThreads};
-  const auto n = static_cast<std::uint32_t>(copy.n - first < kThreads ? copy.n - first : kThreads);
+__global__ void __launch_bounds__(kThreads) copy_rows_kernel(const CopyRows copy, uint32_t units) {
+  __shared__ int64_t from[kThreads], to[kThreads];
+  const int64_t first = blockIdx.x * int64_t{kThreads};
+  const auto n = uint32_t(copy.n - first < kThreads ? copy.n - first : kThreads);
   if (threadIdx.x < n) {
-    const std::int64_t i = first + threadIdx.x;
+    const int64_t i = first + threadIdx.x;
     from[threadIdx.x] = copy.from ? copy.from[i] : i;
     to[threadIdx.x] = copy.to ? copy.to[i] : i;
   }
@@ -64,21 +61,20 @@ __global__ void __launch_bounds__(kThreads) copy_rows_kernel(const CopyRows copy
   const auto* column = reinterpret_cast<const Word*>(copy.column);
   Word* out = reinterpret_cast<Word*>(copy.out);
 #pragma unroll 4
-  for (std::uint32_t i = threadIdx.x; i < n * units; i += kThreads) {
-    const std::uint32_t place = i / units;
-    const std::int64_t k = i - place * units;
+  for (uint32_t i = threadIdx.x; i < n * units; i += kThreads) {
+    const uint32_t place = i / units;
+    const int64_t k = i - place * units;
     out[to[place] * units + k] = column ? column[from[place] * units + k] : Word{};
   }
 }
 
 // Launches the kernel and returns true if the rows are whole, aligned numbers of words of this type.
-template <class Word>
-bool launch_if_whole(const CopyRows& copy, CudaStream stream) {
+template <class Word> bool launch_if_whole(const CopyRows& copy, CudaStream stream) {
   const auto places =
       reinterpret_cast<std::uintptr_t>(copy.column) | reinterpret_cast<std::uintptr_t>(copy.out);
   if (copy.row_bytes % sizeof(Word) != 0 || places % sizeof(Word) != 0) return false;
-  copy_rows_kernel<Word><<<blocks_for(copy.n, kThreads), kThreads, 0, stream>>>(
-      copy, static_cast<std::uint32_t>(copy.row_bytes / sizeof(Word)));
+  copy_rows_kernel<Word>
+      <<<blocks_for(copy.n, kThreads), kThreads, 0, stream>>>(copy, uint32_t(copy.row_bytes / sizeof(Word)));
   check_launch("copy_rows");
   return true;
 }
@@ -92,8 +88,8 @@ __global__ void __launch_bounds__(kKeyThreads) key_histogram_kernel(const KeyHis
   const int digits = 1 << args.width;
   for (int i = threadIdx.x; i < digits; i += kKeyThreads) counts[i] = 0;
   __syncthreads();
-  const std::int64_t prefix = *args.prefix, stride = gridDim.x * std::int64_t{kKeyThreads};
-  for (std::int64_t i = blockIdx.x * std::int64_t{kKeyThreads} + threadIdx.x; i < args.n; i += stride) {
+  const int64_t prefix = *args.prefix, stride = gridDim.x * int64_t{kKeyThreads};
+  for (int64_t i = blockIdx.x * int64_t{kKeyThreads} + threadIdx.x; i < args.n; i += stride) {
     const int digit = digit_of(args, prefix, args.keys[i]);
     if (digit >= 0) atomicAdd(counts + digit, 1u);
   }
@@ -105,17 +101,17 @@ __global__ void __launch_bounds__(kKeyThreads) key_histogram_kernel(const KeyHis
 
 // One block; each thread adds up its part of the counts.
 __global__ void __launch_bounds__(kKeyThreads) find_digit_kernel(const FindDigit args) {
-  __shared__ typename cub::BlockScan<std::int64_t, kKeyThreads>::TempStorage scratch;
-  const std::int64_t digits = std::int64_t{1} << args.width, part = (digits + kKeyThreads - 1) / kKeyThreads;
-  const std::int64_t begin = threadIdx.x * part, end = begin + part < digits ? begin + part : digits;
-  const std::int64_t wanted = args.search[1];
-  std::int64_t sum = 0, before;
-  for (std::int64_t digit = begin; digit < end; ++digit) sum += args.counts[digit];
-  cub::BlockScan<std::int64_t, kKeyThreads>(scratch).ExclusiveSum(sum, before);
+  __shared__ typename cub::BlockScan<int64_t, kKeyThreads>::TempStorage scratch;
+  const int64_t digits = int64_t{1} << args.width, part = (digits + kKeyThreads - 1) / kKeyThreads;
+  const int64_t begin = threadIdx.x * part, end = begin + part < digits ? begin + part : digits;
+  const int64_t wanted = args.search[1];
+  int64_t sum = 0, before;
+  for (int64_t digit = begin; digit < end; ++digit) sum += args.counts[digit];
+  cub::BlockScan<int64_t, kKeyThreads>(scratch).ExclusiveSum(sum, before);
   __syncthreads();  // all have read what one of them writes
   const bool is_last = begin < digits && end == digits;
   if (before >= wanted || (before + sum < wanted && !is_last)) return;
-  std::int64_t digit = begin;
+  int64_t digit = begin;
   while (digit < end - 1 && before + args.counts[digit] < wanted) before += args.counts[digit++];
   take_digit(args, digit, before);
 }
@@ -125,43 +121,43 @@ __global__ void __launch_bounds__(kKeyThreads) find_digit_kernel(const FindDigit
 constexpr int kQueryThreads = 128;
 
 // The Morton codes and rows of points [n, 3], one thread per point.
-__global__ void make_codes(const float* points, std::int32_t n, const MortonBounds* bounds,
-                           std::uint64_t* codes, std::int32_t* rows) {
-  const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
+__global__ void make_codes(const float* points, int32_t n, const MortonBounds* bounds, uint64_t* codes,
+                           int32_t* rows) {
+  const int64_t i = blockIdx.x * int64_t{blockDim.x} + threadIdx.x;
   if (i >= n) return;
   codes[i] = morton_code(points + 3 * i, frame_of(*bounds));
-  rows[i] = static_cast<std::int32_t>(i);
+  rows[i] = int32_t(i);
 }
 
 // sorted [n, 3] = the points in the order of the curve, one thread per point.
-__global__ void gather_points(const float* points, const std::int32_t* order, std::int32_t n, float* sorted) {
-  const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
+__global__ void gather_points(const float* points, const int32_t* order, int32_t n, float* sorted) {
+  const int64_t i = blockIdx.x * int64_t{blockDim.x} + threadIdx.x;
   if (i >= n) return;
-  for (int axis = 0; axis < 3; ++axis) sorted[3 * i + axis] = points[3 * std::int64_t{order[i]} + axis];
+  for (int axis = 0; axis < 3; ++axis) sorted[3 * i + axis] = points[3 * int64_t{order[i]} + axis];
 }
 
 // distances [N, k], one thread per sorted point.
 template <int K>
 __global__ void __launch_bounds__(kQueryThreads)
     query_kernel(const KnnTree<float> tree, int k, float* distances) {
-  const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
-  if (i < tree.n) knn_row<float, K>(tree, static_cast<std::int32_t>(i), k, distances);
+  const int64_t i = blockIdx.x * int64_t{blockDim.x} + threadIdx.x;
+  if (i < tree.n) knn_row<float, K>(tree, int32_t(i), k, distances);
 }
 
-__global__ void fill_infinite(float* values, std::int64_t n) {
-  const std::int64_t i = blockIdx.x * std::int64_t{blockDim.x} + threadIdx.x;
+__global__ void fill_infinite(float* values, int64_t n) {
+  const int64_t i = blockIdx.x * int64_t{blockDim.x} + threadIdx.x;
   if (i < n) values[i] = INFINITY;
 }
 
 // Sorts the rows along the curve and returns the number of finite points. It waits for the stream, because
 // this number determines the shape of the tree.
-std::int32_t sort_along_curve(const float* points, std::int32_t n, std::int32_t* order, Workspace& workspace,
-                              cudaStream_t stream) {
+int32_t sort_along_curve(const float* points, int32_t n, int32_t* order, Workspace& workspace,
+                         cudaStream_t stream) {
   MortonBounds* bounds = find_morton_bounds(points, n, workspace, stream);
-  std::uint64_t* codes = workspace.allocate<std::uint64_t>(2 * std::int64_t{n});
-  std::int32_t* rows = workspace.allocate<std::int32_t>(n);
+  uint64_t* codes = workspace.allocate<uint64_t>(2 * int64_t{n});
+  int32_t* rows = workspace.allocate<int32_t>(n);
   make_codes<<<blocks_for(n, 256), 256, 0, stream>>>(points, n, bounds, codes, rows);
-  run_cub("knn", workspace, [&](void* scratch, std::size_t& bytes) {
+  run_cub("knn", workspace, [&](void* scratch, size_t& bytes) {
     return cub::DeviceRadixSort::SortPairs(scratch, bytes, codes, codes + n, rows, order, n, 0, 64, stream);
   });
   return read_back("knn", &bounds->finite, stream);
@@ -169,20 +165,19 @@ std::int32_t sort_along_curve(const float* points, std::int32_t n, std::int32_t*
 
 }  // namespace
 
-void clear_flag(std::int32_t* bad, CudaStream stream) {
+void clear_flag(int32_t* bad, CudaStream stream) {
   check(cudaMemsetAsync(bad, 0, sizeof(*bad), stream), "find_non_finite");
 }
 
-template <>
-void check_columns<float>(const CheckedColumns<float>& checked, CudaStream stream) {
+template <> void check_columns<float>(const CheckedColumns<float>& checked, CudaStream stream) {
   if (checked.n == 0) return;
-  check_columns_kernel<<<dim3(kBlocks, static_cast<unsigned>(checked.n)), kThreads, 0, stream>>>(checked);
+  check_columns_kernel<<<dim3(kBlocks, unsigned(checked.n)), kThreads, 0, stream>>>(checked);
   check_launch("find_non_finite");
 }
 
 void tree_sums(const TreeSumsArgs& args, CudaStream stream) {
   if (args.n_rows == 0) return;
-  const std::size_t bytes = args.n_features * kThreads * sizeof(float);
+  const size_t bytes = args.n_features * kThreads * sizeof(float);
   launch_early("tree_sums", tree_sums_kernel, {blocks_for(args.n_rows, kThreads), kThreads, stream, bytes},
                args);
 }
@@ -204,8 +199,8 @@ template void for_each_row(const KnnLevel<float>&, CudaStream);
 void copy_rows(const CopyRows& copy, CudaStream stream) {
   if (copy.n == 0 || copy.row_bytes == 0) return;
   if (launch_if_whole<uint4>(copy, stream) || launch_if_whole<uint2>(copy, stream)) return;
-  if (launch_if_whole<std::uint32_t>(copy, stream)) return;
-  launch_if_whole<std::uint8_t>(copy, stream);
+  if (launch_if_whole<uint32_t>(copy, stream)) return;
+  launch_if_whole<uint8_t>(copy, stream);
 }
 
 void key_histogram(const KeyHistogram& args, CudaStream stream) {
@@ -221,16 +216,15 @@ void find_digit(const FindDigit& args, CudaStream stream) {
 }
 
 template <class T>
-void knn_distances(const T* points, std::int32_t n, int k, T* distances, Workspace& workspace,
-                   CudaStream stream) {
+void knn_distances(const T* points, int32_t n, int k, T* distances, Workspace& workspace, CudaStream stream) {
   if (n == 0) return;
-  const std::int64_t values = std::int64_t{n} * k;
+  const int64_t values = int64_t{n} * k;
   fill_infinite<<<blocks_for(values, 256), 256, 0, stream>>>(distances, values);
-  std::int32_t* order = workspace.allocate<std::int32_t>(n);
+  int32_t* order = workspace.allocate<int32_t>(n);
   KnnTree<float> tree{};
   tree.n = sort_along_curve(points, n, order, workspace, stream);
   if (tree.n == 0) return;
-  float* sorted = workspace.allocate<float>(3 * std::int64_t{tree.n});
+  float* sorted = workspace.allocate<float>(3 * int64_t{tree.n});
   gather_points<<<blocks_for(tree.n, 256), 256, 0, stream>>>(points, order, tree.n, sorted);
   tree.points = sorted;
   tree.order = order;
@@ -241,6 +235,6 @@ void knn_distances(const T* points, std::int32_t n, int k, T* distances, Workspa
   check_launch("knn_distances");
 }
 
-template void knn_distances<float>(const float*, std::int32_t, int, float*, Workspace&, CudaStream);
+template void knn_distances<float>(const float*, int32_t, int, float*, Workspace&, CudaStream);
 
 }  // namespace blitzgs::cuda

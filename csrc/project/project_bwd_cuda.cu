@@ -4,7 +4,6 @@
 #include "project/project_bwd_device.cuh"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 constexpr int kPoseThreads = 256;
@@ -15,7 +14,7 @@ struct StoreGradients {
   struct Shared {};
   struct Own {};
   ProjectGradients<float> out;
-  std::int64_t stride;  // floats in a row of SH
+  int64_t stride;  // floats in a row of SH
 
   __device__ Own begin(Shared&, const WarpRows&) const { return {}; }
   __device__ void take(Shared&, Own&, const WarpRows& warp, TripleStage& triple, const Vec3<float>& v_mean,
@@ -52,9 +51,7 @@ struct StoreGradients {
 
  private:
   // The row of the outputs that belongs to this lane's Gaussian.
-  __device__ std::int64_t row(const WarpRows& warp) const {
-    return out.dense ? warp.id : warp.first + warp.lane;
-  }
+  __device__ int64_t row(const WarpRows& warp) const { return out.dense ? warp.id : warp.first + warp.lane; }
 };
 
 // Computes the gradient of the camera pose of view blockIdx.y from kProjectBlock visible Gaussians. The grid
@@ -71,12 +68,12 @@ __global__ void __launch_bounds__(kPoseThreads)
   __syncthreads();
   const int view = blockIdx.y;
   PoseGradient<float> pose{};
-  for (int round = 0; round < static_cast<int>(kProjectBlock) / kPoseThreads; ++round) {
-    const std::int64_t u = blockIdx.x * kProjectBlock + round * kPoseThreads + threadIdx.x;
+  for (int round = 0; round < int(kProjectBlock) / kPoseThreads; ++round) {
+    const int64_t u = blockIdx.x * kProjectBlock + round * kPoseThreads + threadIdx.x;
     if (u >= args.splats.n_visible) break;
-    for (std::int64_t r = args.splats.splat_offsets[u]; r < args.splats.splat_offsets[u + 1]; ++r) {
+    for (int64_t r = args.splats.splat_offsets[u]; r < args.splats.splat_offsets[u + 1]; ++r) {
       if (args.splats.camera_ids[r] != view) continue;
-      const std::int64_t id = args.splats.visible_ids[u];
+      const int64_t id = args.splats.visible_ids[u];
       const ActivatedGaussian<float> gaussian = load_gaussian(in, id);
       GaussianGradient<float> unused{};
       project_splat_vjp(cameras[view], gaussian, in.options, args.v.geometry(r), &unused, &pose);
@@ -88,7 +85,7 @@ __global__ void __launch_bounds__(kPoseThreads)
     }
   }
   const Vec3<float> columns[4] = {pose.row_x, pose.row_y, pose.row_z, pose.translation};
-  double* target = partial + (static_cast<std::int64_t>(blockIdx.x) * gridDim.y + view) * 12;
+  double* target = partial + (int64_t(blockIdx.x) * gridDim.y + view) * 12;
   for (int i = 0; i < 4; ++i) {
     const double values[3] = {columns[i].x, columns[i].y, columns[i].z};
     for (int k = 0; k < 3; ++k) {
@@ -102,17 +99,15 @@ __global__ void __launch_bounds__(kPoseThreads)
 // Sums the partial pose gradients [n_blocks, B, 12] over the blocks into v_viewmats [B, 4, 4]: a block of 16
 // threads for each view, one thread per entry of the matrix. The 12 values of `partial` are the three rows of
 // the rotation (9), then the translation (3). The last row of the matrix has the gradient 0.
-__global__ void reduce_poses_kernel(const double* partial, std::int64_t n_blocks, int n_views,
-                                    float* v_viewmats) {
+__global__ void reduce_poses_kernel(const double* partial, int64_t n_blocks, int n_views, float* v_viewmats) {
   const int view = blockIdx.x, i = threadIdx.x;
   const int row = i / 4, column = i % 4;
   double sum = 0;
   const int source = column < 3 ? 3 * row + column : 9 + row;
   if (row < 3) {
-    for (std::int64_t block = 0; block < n_blocks; ++block)
-      sum += partial[(block * n_views + view) * 12 + source];
+    for (int64_t block = 0; block < n_blocks; ++block) sum += partial[(block * n_views + view) * 12 + source];
   }
-  v_viewmats[16 * view + i] = static_cast<float>(sum);
+  v_viewmats[16 * view + i] = float(sum);
 }
 
 constexpr int kZeroThreads = 256;
@@ -120,40 +115,37 @@ constexpr int kZeroThreads = 256;
 // The arrays begin at multiples of 16 bytes, so a thread writes four floats at a time.
 __global__ void __launch_bounds__(kZeroThreads) zero_arrays_kernel(const ZeroedArrays<float> arrays) {
   wait_for_earlier_kernels();
-  const std::int64_t first = blockIdx.x * std::int64_t{kZeroThreads} + threadIdx.x;
-  const std::int64_t step = gridDim.x * std::int64_t{kZeroThreads};
+  const int64_t first = blockIdx.x * int64_t{kZeroThreads} + threadIdx.x;
+  const int64_t step = gridDim.x * int64_t{kZeroThreads};
 #pragma unroll
   for (int a = 0; a < ZeroedArrays<float>::kCount; ++a) {
     float* const begin = arrays.begin[a];
-    const std::int64_t fours = arrays.length[a] / 4;
-    for (std::int64_t i = first; i < fours; i += step) {
+    const int64_t fours = arrays.length[a] / 4;
+    for (int64_t i = first; i < fours; i += step) {
       reinterpret_cast<float4*>(begin)[i] = make_float4(0.f, 0.f, 0.f, 0.f);
     }
-    const std::int64_t rest = 4 * fours + first;
+    const int64_t rest = 4 * fours + first;
     if (rest < arrays.length[a]) begin[rest] = 0.f;
   }
 }
 
 }  // namespace
 
-template <>
-void zero_arrays<float>(const ZeroedArrays<float>& arrays, CudaStream stream) {
-  std::int64_t most = 0;
-  for (const std::int64_t length : arrays.length) most = length > most ? length : most;
+template <> void zero_arrays<float>(const ZeroedArrays<float>& arrays, CudaStream stream) {
+  int64_t most = 0;
+  for (const int64_t length : arrays.length) most = length > most ? length : most;
   if (most == 0) return;
-  const unsigned at_a_time = 8u * static_cast<unsigned>(multiprocessors());
-  const std::int64_t needed = (most + 4 * kZeroThreads - 1) / (4 * kZeroThreads);
-  const unsigned blocks = needed < at_a_time ? static_cast<unsigned>(needed) : at_a_time;
-  launch_early("project_bwd", zero_arrays_kernel, {blocks, kZeroThreads, stream}, arrays);
+  launch_early("project_bwd", zero_arrays_kernel,
+               {resident_blocks(most, 4 * kZeroThreads, 8), kZeroThreads, stream}, arrays);
 }
 
 template <>
 void project_bwd<float>(const Inputs& in, const SplatIndex& splats, const SplatGradientSource<float>& v,
                         const Regularisers<float>& regularisers, const ProjectGradients<float>& out,
                         Workspace& workspace, CudaStream stream) {
-  const std::int64_t blocks = project_blocks(splats.n_visible);
+  const int64_t blocks = project_blocks(splats.n_visible);
   if (out.viewmats && in.n_views > 0) {
-    const std::size_t bytes = 16 * in.n_views * sizeof(float);
+    const size_t bytes = 16 * in.n_views * sizeof(float);
     check(cudaMemsetAsync(out.viewmats, 0, bytes, stream), "project_bwd");
   }
   if (blocks == 0) return;
@@ -166,7 +158,7 @@ void project_bwd<float>(const Inputs& in, const SplatIndex& splats, const SplatG
   std::visit(
       [&](const auto& source) {
         const BackwardInputs<std::decay_t<decltype(source)>> args{in, splats, source, regularisers};
-        const dim3 grid(static_cast<unsigned>(blocks), in.n_views);
+        const dim3 grid(unsigned(blocks), in.n_views);
         pose_kernel<<<grid, kPoseThreads, 0, stream>>>(args, partial);
       },
       v);

@@ -2,7 +2,6 @@
 // The kernel of the projection's backward pass on CUDA. It gives the gradients of the parameters to a sink:
 // that of project_bwd_cuda.cu stores them, that of project_step_cuda.cu takes the optimiser's step with them.
 #pragma once
-#include "common/cuda.cuh"
 #include "project/project.h"
 #include "project/project_device.cuh"
 
@@ -11,8 +10,7 @@ namespace blitzgs::cuda {
 constexpr int kBackwardThreads = 128;
 
 // v: the gradients of the splats, one alternative of SplatGradientSource.
-template <class Source>
-struct BackwardInputs {
+template <class Source> struct BackwardInputs {
   Inputs in;
   SplatIndex splats;
   Source v;
@@ -33,17 +31,17 @@ void dispatch_backward(const Inputs& in, const SplatIndex& splats, const SplatGr
 
 // The visible Gaussians of a warp, one per lane.
 struct WarpRows {
-  std::int64_t first;  // the position of the first of them in visible_ids
-  std::int64_t count;  // the length of visible_ids from there on (may exceed 32)
-  std::int32_t id;     // the Gaussian of this lane; -1: none
-  int warp, lane;      // the warp's index in the block, the lane's in the warp
+  int64_t first;   // the position of the first of them in visible_ids
+  int64_t count;   // the length of visible_ids from there on (may exceed 32)
+  int32_t id;      // the Gaussian of this lane; -1: none
+  int warp, lane;  // the warp's index in the block, the lane's in the warp
 };
 
 // The gradients of the Gaussians' parameters: those of the splats taken back through the projection, the
-// colours and the activations (docs/image.md, sections 4, 2 and 1). One thread per visible Gaussian; it
-// recomputes the Gaussian's splats and sums over them in order. The gradients go to the sink. Every thread
-// calls sink.begin() before the block's only barrier, and sink.take() and then sink.take_sh() at the end; the
-// sink may use the warp's stages to reorder values between lanes.
+// colours and the activations (docs/image.md, sections 4, 2 and 1). One thread per visible Gaussian
+// recomputes its splats and sums over them in order. Every thread calls sink.begin() before the block's only
+// barrier, and sink.take() and then sink.take_sh() at the end; the sink may use the warp's stages to reorder
+// values between lanes.
 template <int DEGREE, bool QUADS, class Source, class Sink>
 __global__ void __launch_bounds__(kBackwardThreads, 3)
     project_backward_kernel(const __grid_constant__ BackwardInputs<Source> args,
@@ -57,19 +55,19 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   const int lane = threadIdx.x % 32;
   ShStage<DEGREE>& stage = stages[QUADS ? threadIdx.x / 32 : 0];
   TripleStage& triple = triples[threadIdx.x / 32];
-  const std::int64_t first = blockIdx.x * static_cast<std::int64_t>(kBackwardThreads) + threadIdx.x / 32 * 32;
-  const std::int64_t u = first + lane;
+  const int64_t first = blockIdx.x * int64_t(kBackwardThreads) + threadIdx.x / 32 * 32;
+  const int64_t u = first + lane;
   const bool exists = u < args.splats.n_visible;
-  const std::int32_t id = exists ? args.splats.visible_ids[u] : -1,
-                     begin = exists ? args.splats.splat_offsets[u] : 0,
-                     end = exists ? args.splats.splat_offsets[u + 1] : 0;
-  const std::int64_t stride = 3 * in.options.sh_stride;
+  const int32_t id = exists ? args.splats.visible_ids[u] : -1,
+                begin = exists ? args.splats.splat_offsets[u] : 0,
+                end = exists ? args.splats.splat_offsets[u + 1] : 0;
+  const int64_t stride = 3 * in.options.sh_stride;
   const bool has_colors = in.sh && args.v.colored();
   if constexpr (QUADS) {
     if (has_colors) stage.gather(in.sh, stride, id, lane);
   }
   // Issue all early loads before the first wait, so that their latencies overlap.
-  const std::int64_t known = id < 0 ? 0 : id;
+  const int64_t known = id < 0 ? 0 : id;
   const Vec3<float> mean_part = TripleStage::fetch(in.means, id, lane),
                     scale_part = TripleStage::fetch(in.scales, id, lane);
   float quat[4];
@@ -77,13 +75,13 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   const float opacity = in.opacities[known], inverse_reach2 = inverse_reach2_of(in.fade, known);
   GeometryGradient<float> v_splat{};
   int view = 0;
-  const auto load_splat = [&](std::int64_t r) {
+  const auto load_splat = [&](int64_t r) {
     if (r >= end) return;
     view = args.splats.camera_ids[r];
     v_splat = args.v.geometry(r);
   };
   load_splat(begin);
-  const WarpRows warp{first, args.splats.n_visible - first, id, static_cast<int>(threadIdx.x) / 32, lane};
+  const WarpRows warp{first, args.splats.n_visible - first, id, int(threadIdx.x) / 32, lane};
   load_cameras(in, cameras);
   auto own = sink.begin(shared, warp);
   __syncthreads();
@@ -96,7 +94,7 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
   GaussianGradient<float> gradient{};
   float axis_weight = 0.f;
   PoseGradient<float>* no_pose = nullptr;
-  for (std::int64_t r = begin; r < end; ++r) {
+  for (int64_t r = begin; r < end; ++r) {
     project_splat_vjp(cameras[view], gaussian, in.options, v_splat, &gradient, no_pose);
     if (args.regularisers.scale) axis_weight += args.regularisers.scale[view];
     if (args.regularisers.opacity) gradient.opacity += args.regularisers.opacity[view];
@@ -117,7 +115,7 @@ __global__ void __launch_bounds__(kBackwardThreads, 3)
 #pragma unroll
       for (int i = 0; i < Coefficients::kCount; ++i) sh.values[i] = in.sh[stride * id + i];
     }
-    for (std::int64_t r = begin; r < end; ++r) {
+    for (int64_t r = begin; r < end; ++r) {
       const Vec3<float> v_color = args.v.color(r);
       splat_color_vjp(cameras[args.splats.camera_ids[r]], mean, sh.values, DEGREE, &v_color.x, v_sh.values,
                       &gradient.mean, no_pose);

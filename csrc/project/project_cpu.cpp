@@ -1,6 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
-#include <cmath>
 #include <mutex>
 #include <utility>
 #include <vector>
@@ -11,51 +9,46 @@
 namespace blitzgs::cpu {
 namespace {
 
-template <class T>
-std::vector<Camera<T>> make_cameras(const ProjectInputs<T>& in) {
+template <class T> std::vector<Camera<T>> make_cameras(const ProjectInputs<T>& in) {
   std::vector<Camera<T>> cameras;
   for (int view = 0; view < in.n_views; ++view) cameras.push_back(in.camera(view));
   return cameras;
 }
 
-template <class T>
-ActivatedGaussian<T> load_gaussian(const ProjectInputs<T>& in, std::int64_t id) {
+template <class T> ActivatedGaussian<T> load_gaussian(const ProjectInputs<T>& in, int64_t id) {
   return activate_gaussian(
       load3(in.means + 3 * id), in.quats + 4 * id, activate_scale(in.scales + 3 * id, in.options.raw),
-      activate_opacity(in.opacities[id], in.options.raw), static_cast<T>(inverse_reach2_of(in.fade, id)));
+      activate_opacity(in.opacities[id], in.options.raw), T(inverse_reach2_of(in.fade, id)));
 }
 
 // A splat that the counting pass of project() found, kept for the writing pass: the splat, its Gaussian and
 // view, the number of its tiles, and the ranks that need it as bits.
-template <class T>
-struct KeptSplat {
+template <class T> struct KeptSplat {
   Splat<T> splat;
-  std::int32_t id, view, tiles;
-  std::int64_t ranks;
+  int32_t id, view, tiles;
+  int64_t ranks;
 };
 
 // The result of the counting pass for a block of kProjectBlock candidates: its splats, the number of its
 // visible Gaussians, and the numbers of visible Gaussians and splats in all blocks before it.
-template <class T>
-struct CountedBlock {
+template <class T> struct CountedBlock {
   std::vector<KeptSplat<T>> splats;
-  std::int64_t visible = 0, visible_before = 0, splats_before = 0;
+  int64_t visible = 0, visible_before = 0, splats_before = 0;
 };
 
 // Projects a candidate into the views that may see it, appends its splats to `splats` and adds to `totals`.
 template <class T>
 void project_candidate(const ProjectInputs<T>& in, const RankTiles& rank_tiles,
                        const std::vector<Camera<T>>& cameras, const std::vector<Frustum>& frusta,
-                       std::int64_t candidate, std::vector<KeptSplat<T>>* splats, std::int64_t* totals) {
-  const std::int64_t id = in.candidate_id(candidate);
-  const std::uint32_t allowed =
-      in.active_views ? static_cast<std::uint32_t>(in.active_views[candidate]) : ~std::uint32_t{0};
+                       int64_t candidate, std::vector<KeptSplat<T>>* splats, int64_t* totals) {
+  const int64_t id = in.candidate_id(candidate);
+  const uint32_t allowed = in.active_views ? uint32_t(in.active_views[candidate]) : ~uint32_t{0};
   const Vec3<T> mean = load3(in.means + 3 * id);
-  const Vec3<float> point{static_cast<float>(mean.x), static_cast<float>(mean.y), static_cast<float>(mean.z)};
+  const Vec3<float> point{float(mean.x), float(mean.y), float(mean.z)};
   const float norm = norm1(point);
-  std::uint32_t maybe = 0;
+  uint32_t maybe = 0;
   for (int view = 0; view < in.n_views; ++view) {
-    maybe |= static_cast<std::uint32_t>(may_be_in_depth(frusta[view], point, norm)) << view;
+    maybe |= uint32_t(may_be_in_depth(frusta[view], point, norm)) << view;
   }
   maybe &= allowed;
   if (maybe == 0) return;
@@ -64,22 +57,22 @@ void project_candidate(const ProjectInputs<T>& in, const RankTiles& rank_tiles,
   if (visible_sigmas(opacity) < T(0)) return;
   // A stored scale may be negative; the Gaussian is that of its absolute value.
   const T widest = larger(larger(std::fabs(scale.x), std::fabs(scale.y)), std::fabs(scale.z));
-  const float sigma = opacity <= T(1) ? 1.00001f * static_cast<float>(widest) : kAnyWidth;
+  const float sigma = opacity <= T(1) ? 1.00001f * float(widest) : kAnyWidth;
   ActivatedGaussian<T> gaussian{};
-  const std::size_t before = splats->size();
-  std::int64_t* by_rank = totals + kTotalViews + in.n_views;
-  for (std::uint32_t rest = maybe, first = 1; rest != 0; rest &= rest - 1) {
+  const size_t before = splats->size();
+  int64_t* by_rank = totals + kTotalViews + in.n_views;
+  for (uint32_t rest = maybe, first = 1; rest != 0; rest &= rest - 1) {
     const int view = __builtin_ctz(rest);
     if (!may_overlap(frusta[view], point, norm, sigma)) continue;
     if (first) {
-      gaussian = activate_gaussian(mean, in.quats + 4 * id, scale, opacity,
-                                   static_cast<T>(inverse_reach2_of(in.fade, id)));
+      gaussian =
+          activate_gaussian(mean, in.quats + 4 * id, scale, opacity, T(inverse_reach2_of(in.fade, id)));
       first = 0;
     }
-    KeptSplat<T> kept{{}, static_cast<std::int32_t>(id), view, 0, 0};
+    KeptSplat<T> kept{{}, int32_t(id), view, 0, 0};
     if (!project_splat(cameras[view], gaussian, in.options, &kept.splat)) continue;
     kept.tiles = splat_tiles(kept.splat, view, in.options, rank_tiles, &kept.ranks,
-                             [&](int rank, std::int64_t tiles) { by_rank[2 * rank + 1] += tiles; });
+                             [&](int rank, int64_t tiles) { by_rank[2 * rank + 1] += tiles; });
     for (int rank = 0; rank < rank_tiles.n_ranks; ++rank) by_rank[2 * rank] += kept.ranks >> rank & 1;
     ++totals[kTotalSplats];
     ++totals[kTotalViews + view];
@@ -90,10 +83,10 @@ void project_candidate(const ProjectInputs<T>& in, const RankTiles& rank_tiles,
 }
 
 template <class T>
-void write_splat(const ProjectInputs<T>& in, const Camera<T>& camera, std::int64_t index,
-                 const KeptSplat<T>& kept, const ProjectOutputs<T>& out) {
+void write_splat(const ProjectInputs<T>& in, const Camera<T>& camera, int64_t index, const KeptSplat<T>& kept,
+                 const ProjectOutputs<T>& out) {
   const Splat<T>& splat = kept.splat;
-  const std::int64_t id = kept.id;
+  const int64_t id = kept.id;
   std::copy_n(splat.mean2d, 2, out.means2d + 2 * index);
   std::copy_n(splat.conic, 3, out.conics + 3 * index);
   out.depths[index] = splat.depth;
@@ -111,16 +104,16 @@ void write_splat(const ProjectInputs<T>& in, const Camera<T>& camera, std::int64
 // Computes the gradients of visible Gaussian u and adds to those of the camera poses, [B] or null.
 template <class T>
 void gaussian_bwd(const ProjectInputs<T>& in, const std::vector<Camera<T>>& cameras, const SplatIndex& splats,
-                  const SplatGradientColumns<T>& v, const Regularisers<T>& regularisers, std::int64_t u,
+                  const SplatGradientColumns<T>& v, const Regularisers<T>& regularisers, int64_t u,
                   PoseGradient<T>* poses, const ProjectGradients<T>& out) {
-  const std::int64_t id = splats.visible_ids[u];
-  const std::int64_t stride = 3 * in.options.sh_stride;
+  const int64_t id = splats.visible_ids[u];
+  const int64_t stride = 3 * in.options.sh_stride;
   const ActivatedGaussian<T> gaussian = load_gaussian(in, id);
   GaussianGradient<T> gradient{};
   T axis_weight = T(0);
-  const std::int64_t at = out.dense ? id : u;
+  const int64_t at = out.dense ? id : u;
   if (out.sh) std::fill_n(out.sh + stride * at, stride, T(0));
-  for (std::int64_t r = splats.splat_offsets[u]; r < splats.splat_offsets[u + 1]; ++r) {
+  for (int64_t r = splats.splat_offsets[u]; r < splats.splat_offsets[u + 1]; ++r) {
     const int view = splats.camera_ids[r];
     PoseGradient<T>* pose = poses ? poses + view : nullptr;
     project_splat_vjp(cameras[view], gaussian, in.options, v.geometry(r), &gradient, pose);
@@ -136,8 +129,7 @@ void gaussian_bwd(const ProjectInputs<T>& in, const std::vector<Camera<T>>& came
 }
 
 // Adds the pose gradients [B] of one block to the block's sums [B, 12].
-template <class T>
-void store_poses(const std::vector<PoseGradient<T>>& poses, double* sums) {
+template <class T> void store_poses(const std::vector<PoseGradient<T>>& poses, double* sums) {
   for (const PoseGradient<T>& pose : poses) {
     const Vec3<T> columns[4] = {pose.row_x, pose.row_y, pose.row_z, pose.translation};
     for (const Vec3<T>& column : columns) {
@@ -148,15 +140,14 @@ void store_poses(const std::vector<PoseGradient<T>>& poses, double* sums) {
   }
 }
 
-template <class T>
-void reduce_poses(const double* sums, std::int64_t n_blocks, int n_views, T* v_viewmats) {
+template <class T> void reduce_poses(const double* sums, int64_t n_blocks, int n_views, T* v_viewmats) {
   std::fill_n(v_viewmats, 16 * n_views, T(0));
   for (int view = 0; view < n_views; ++view) {
     for (int i = 0; i < 12; ++i) {
       double sum = 0;
-      for (std::int64_t block = 0; block < n_blocks; ++block) sum += sums[(block * n_views + view) * 12 + i];
+      for (int64_t block = 0; block < n_blocks; ++block) sum += sums[(block * n_views + view) * 12 + i];
       const int row = i < 9 ? i / 3 : i - 9, column = i < 9 ? i % 3 : 3;
-      v_viewmats[16 * view + 4 * row + column] = static_cast<T>(sum);
+      v_viewmats[16 * view + 4 * row + column] = T(sum);
     }
   }
 }
@@ -165,40 +156,40 @@ void reduce_poses(const double* sums, std::int64_t n_blocks, int n_views, T* v_v
 
 template <class T>
 void project(const ProjectInputs<T>& in, const RankTiles& rank_tiles, const ProjectSizes*,
-             const SplatMemory<T>& memory, std::int64_t* totals, Workspace&, CudaStream) {
+             const SplatMemory<T>& memory, int64_t* totals, Workspace&, CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
   std::vector<Frustum> frusta;
   for (const Camera<T>& camera : cameras) frusta.push_back(frustum_of(camera, in.options));
-  const std::int64_t n_totals = project_totals(in.n_views, rank_tiles.n_ranks);
+  const int64_t n_totals = project_totals(in.n_views, rank_tiles.n_ranks);
   std::vector<CountedBlock<T>> blocks(project_blocks(in.n_candidates));
   std::fill_n(totals, n_totals, 0);
   if (in.n_blocks) totals[kTotalBlocks] = *in.n_blocks;
   std::mutex adding;
-  parallel_rows(std::ssize(blocks), 1, [&](std::int64_t b) {
+  parallel_rows(std::ssize(blocks), 1, [&](int64_t b) {
     CountedBlock<T>& block = blocks[b];
-    std::vector<std::int64_t> sums(n_totals, 0);
-    for (std::int64_t c = b * kProjectBlock; c < std::min(in.n_candidates, (b + 1) * kProjectBlock); ++c) {
+    std::vector<int64_t> sums(n_totals, 0);
+    for (int64_t c = b * kProjectBlock; c < std::min(in.n_candidates, (b + 1) * kProjectBlock); ++c) {
       project_candidate(in, rank_tiles, cameras, frusta, c, &block.splats, sums.data());
     }
     block.visible = sums[kTotalVisible];
     const std::lock_guard<std::mutex> lock(adding);
-    for (std::int64_t i = 0; i < n_totals; ++i) totals[i] += sums[i];
+    for (int64_t i = 0; i < n_totals; ++i) totals[i] += sums[i];
   });
-  std::int64_t visible = 0, splats = 0;
+  int64_t visible = 0, splats = 0;
   for (CountedBlock<T>& block : blocks) {
     block.visible_before = std::exchange(visible, visible + block.visible);
-    block.splats_before = std::exchange(splats, splats + static_cast<std::int64_t>(block.splats.size()));
+    block.splats_before = std::exchange(splats, splats + int64_t(block.splats.size()));
   }
   const ProjectColumns<T> columns = memory({visible, splats});
   const ProjectIds& ids = columns.ids;
-  ids.splat_offsets[visible] = static_cast<std::int32_t>(splats);
-  parallel_rows(std::ssize(blocks), 1, [&](std::int64_t b) {
-    std::int64_t u = blocks[b].visible_before, index = blocks[b].splats_before;
-    std::int32_t previous = -1;
+  ids.splat_offsets[visible] = int32_t(splats);
+  parallel_rows(std::ssize(blocks), 1, [&](int64_t b) {
+    int64_t u = blocks[b].visible_before, index = blocks[b].splats_before;
+    int32_t previous = -1;
     for (const KeptSplat<T>& kept : blocks[b].splats) {
       if (kept.id != previous) {
         ids.visible_ids[u] = previous = kept.id;
-        ids.splat_offsets[u++] = static_cast<std::int32_t>(index);
+        ids.splat_offsets[u++] = int32_t(index);
       }
       ids.gaussian_ids[index] = kept.id;
       ids.camera_ids[index] = kept.view;
@@ -212,8 +203,8 @@ void color_splats(const ProjectInputs<T>& in, const ProjectCapacity& capacity,
                   const ProjectColumns<T>& columns, CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
   const ProjectOutputs<T>& out = columns.values;
-  parallel_rows(capacity.sizes.splats, 1 << 10, [&](std::int64_t i) {
-    const std::int64_t id = columns.ids.gaussian_ids[i];
+  parallel_rows(capacity.sizes.splats, 1 << 10, [&](int64_t i) {
+    const int64_t id = columns.ids.gaussian_ids[i];
     if (splat_color(cameras[columns.ids.camera_ids[i]], load3(in.means + 3 * id),
                     in.sh + 3 * in.options.sh_stride * id, in.options.sh_degree, out.colors + 3 * i)) {
       return;
@@ -228,12 +219,12 @@ void project_bwd(const ProjectInputs<T>& in, const SplatIndex& splats, const Spl
                  const Regularisers<T>& regularisers, const ProjectGradients<T>& out, Workspace&,
                  CudaStream) {
   const std::vector<Camera<T>> cameras = make_cameras(in);
-  const std::int64_t blocks = project_blocks(splats.n_visible);
+  const int64_t blocks = project_blocks(splats.n_visible);
   std::vector<double> pose_sums(out.viewmats ? blocks * in.n_views * 12 : 0, 0.0);
-  parallel_rows(blocks, 1, [&](std::int64_t block) {
+  parallel_rows(blocks, 1, [&](int64_t block) {
     std::vector<PoseGradient<T>> poses(out.viewmats ? in.n_views : 0);
-    const std::int64_t last = std::min(splats.n_visible, (block + 1) * kProjectBlock);
-    for (std::int64_t u = block * kProjectBlock; u < last; ++u) {
+    const int64_t last = std::min(splats.n_visible, (block + 1) * kProjectBlock);
+    for (int64_t u = block * kProjectBlock; u < last; ++u) {
       gaussian_bwd(in, cameras, splats, v, regularisers, u, poses.empty() ? nullptr : poses.data(), out);
     }
     if (out.viewmats) store_poses(poses, &pose_sums[block * in.n_views * 12]);
@@ -241,22 +232,9 @@ void project_bwd(const ProjectInputs<T>& in, const SplatIndex& splats, const Spl
   if (out.viewmats) reduce_poses(pose_sums.data(), blocks, in.n_views, out.viewmats);
 }
 
-template <class T>
-void zero_arrays(const ZeroedArrays<T>& arrays, CudaStream) {
+template <class T> void zero_arrays(const ZeroedArrays<T>& arrays, CudaStream) {
   for (int a = 0; a < ZeroedArrays<T>::kCount; ++a) parallel_zero(arrays.begin[a], arrays.length[a]);
 }
-
-#define BLITZGS_INSTANTIATE(T)                                                                              \
-  template void project<T>(const ProjectInputs<T>&, const RankTiles&, const ProjectSizes*,                  \
-                           const SplatMemory<T>&, std::int64_t*, Workspace&, CudaStream);                   \
-  template void color_splats<T>(const ProjectInputs<T>&, const ProjectCapacity&, const ProjectColumns<T>&,  \
-                                CudaStream);                                                                \
-  template void project_bwd<T>(const ProjectInputs<T>&, const SplatIndex&, const SplatGradientColumns<T>&,  \
-                               const Regularisers<T>&, const ProjectGradients<T>&, Workspace&, CudaStream); \
-  template void zero_arrays<T>(const ZeroedArrays<T>&, CudaStream);
-BLITZGS_INSTANTIATE(float)
-BLITZGS_INSTANTIATE(double)
-#undef BLITZGS_INSTANTIATE
 
 template <class T>
 void project_bwd_step(const ProjectInputs<T>& in, const SplatIndex& splats, const SplatGradientColumns<T>& v,
@@ -267,11 +245,10 @@ void project_bwd_step(const ProjectInputs<T>& in, const SplatIndex& splats, cons
   lazy_adam(adam, workspace, stream);
 }
 
-template void project_bwd_step<float>(const ProjectInputs<float>&, const SplatIndex&,
-                                      const SplatGradientColumns<float>&, const Regularisers<float>&,
-                                      AdamArgs<float>, Workspace&, CudaStream);
-template void project_bwd_step<double>(const ProjectInputs<double>&, const SplatIndex&,
-                                       const SplatGradientColumns<double>&, const Regularisers<double>&,
-                                       AdamArgs<double>, Workspace&, CudaStream);
+BLITZGS_FOR_BOTH_DTYPES(project);
+BLITZGS_FOR_BOTH_DTYPES(color_splats);
+BLITZGS_FOR_BOTH_DTYPES(project_bwd);
+BLITZGS_FOR_BOTH_DTYPES(zero_arrays);
+BLITZGS_FOR_BOTH_DTYPES(project_bwd_step);
 
 }  // namespace blitzgs::cpu

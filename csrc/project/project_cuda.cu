@@ -2,14 +2,12 @@
 // The projection on CUDA: the prefilter of all candidates (kernel 1 of project.h), the colours of the splats
 // (kernel 3), and project(), which queues the three kernels. Compiled without FMA contraction
 // (cmake/cuda.cmake), as write_splats_cuda.cu.
-#include "common/cuda.cuh"
 #include "common/rows.h"
 #include "math/frustum.h"
 #include "project/project_device.cuh"
 #include "project/unscented.h"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 constexpr int kWarps = kPrefilterThreads / 32, kMaxWarpCandidates = kMaxAtOnce / kWarps;
@@ -21,31 +19,30 @@ __device__ __noinline__ void store_frustum(const Camera<float>* camera, int widt
   *frustum = make_frustum(*camera, width, height, near_plane, far_plane, eps2d);
 }
 
-// An upper bound on the Gaussian's largest scale, for may_overlap. That test assumes an opacity of at most 1.
-// A sigmoid always satisfies this; a stored opacity may exceed 1, and then the scale counts as unbounded. A
-// stored scale may be negative; the Gaussian is that of its absolute value.
-__device__ float largest_scale(const Inputs& in, std::int64_t id) {
+// An upper bound on the Gaussian's largest scale, for may_overlap, which assumes an opacity of at most 1: for
+// a larger one, which only a stored opacity can have, the scale counts as unbounded. A stored scale may be
+// negative; the Gaussian is that of its absolute value.
+__device__ float largest_scale(const Inputs& in, int64_t id) {
   const float* s = in.scales + 3 * id;
   if (in.options.raw) return 1.001f * __expf(fmaxf(s[0], fmaxf(s[1], s[2])));
   const float widest = fmaxf(fabsf(s[0]), fmaxf(fabsf(s[1]), fabsf(s[2])));
   return in.opacities[id] <= 1.f ? widest : kAnyWidth;
 }
 
-// Finds the views that may see each of the kPrefilterBatch candidates first, first + 32, ...: first from
-// their means, then, for candidates that some view still may see, from their scales, too. Writes the views as
-// bits to `maybe` and the Gaussians to `ids`.
-__device__ void quick_views(const Inputs& in, std::int64_t n_candidates, const Frustum* frusta,
-                            std::int64_t first, std::uint32_t* maybe, std::int32_t* ids) {
+// Finds the views that may see each of the kPrefilterBatch candidates first, first + 32, ...: from their
+// means, then, if some view still may see it, from their scales. Writes these views, as bits, and ids.
+__device__ void quick_views(const Inputs& in, int64_t n_candidates, const Frustum* frusta, int64_t first,
+                            uint32_t* maybe, int32_t* ids) {
   Vec3<float> means[kPrefilterBatch];
   float norms[kPrefilterBatch];
 #pragma unroll
   for (int k = 0; k < kPrefilterBatch; ++k) {
-    const std::int64_t c = first + 32 * k;
+    const int64_t c = first + 32 * k;
     const bool present = c < n_candidates;
-    ids[k] = present ? static_cast<std::int32_t>(in.candidate_id(c)) : 0;
-    maybe[k] = !present ? 0u : in.active_views ? static_cast<std::uint32_t>(in.active_views[c]) : ~0u;
+    ids[k] = present ? int32_t(in.candidate_id(c)) : 0;
+    maybe[k] = !present ? 0u : in.active_views ? uint32_t(in.active_views[c]) : ~0u;
     if (in.n_views < 32) maybe[k] &= (1u << in.n_views) - 1u;
-    means[k] = maybe[k] ? load3(in.means + std::int64_t{3} * ids[k]) : Vec3<float>{0.f, 0.f, 0.f};
+    means[k] = maybe[k] ? load3(in.means + int64_t{3} * ids[k]) : Vec3<float>{0.f, 0.f, 0.f};
     norms[k] = norm1(means[k]);
   }
   for (int view = 0; view < in.n_views; ++view) {
@@ -74,12 +71,12 @@ __global__ void __launch_bounds__(kPrefilterThreads, kBlocksPerMultiprocessor)
     prefilter_kernel(const Inputs in, const Prefiltered kept, const RunningSum before) {
   __shared__ Camera<float> cameras[kMaxViews];
   __shared__ Frustum frusta[kMaxViews];
-  __shared__ std::uint32_t listed_views[kWarps][kMaxWarpCandidates];
-  __shared__ std::int32_t listed_ids[kWarps][kMaxWarpCandidates];
+  __shared__ uint32_t listed_views[kWarps][kMaxWarpCandidates];
+  __shared__ int32_t listed_ids[kWarps][kMaxWarpCandidates];
   __shared__ int listed_by_warp[kWarps];
-  const std::int64_t n_candidates = candidates_of(in);
+  const int64_t n_candidates = candidates_of(in);
   const int at_once = prefiltered_at_once(n_candidates), warp_candidates = at_once / kWarps;
-  const std::int64_t n_turns = (n_candidates + at_once - 1) / at_once;
+  const int64_t n_turns = (n_candidates + at_once - 1) / at_once;
   if (blockIdx.x == 0 && threadIdx.x == 0 && n_turns == 0) *kept.count = 0;
   if (blockIdx.x >= n_turns) return;
   load_cameras(in, cameras);
@@ -92,11 +89,11 @@ __global__ void __launch_bounds__(kPrefilterThreads, kBlocksPerMultiprocessor)
   for (;;) {
     const int turn = before.take_turn();
     if (turn >= n_turns) return;
-    const std::int64_t first = turn * std::int64_t{at_once} + warp * warp_candidates;
+    const int64_t first = turn * int64_t{at_once} + warp * warp_candidates;
     int n_listed = 0;
     for (int batch = 0; batch < warp_candidates; batch += 32 * kPrefilterBatch) {
-      std::uint32_t maybe[kPrefilterBatch];
-      std::int32_t ids[kPrefilterBatch];
+      uint32_t maybe[kPrefilterBatch];
+      int32_t ids[kPrefilterBatch];
       quick_views(in, n_candidates, frusta, first + batch + lane, maybe, ids);
 #pragma unroll
       for (int k = 0; k < kPrefilterBatch; ++k) {
@@ -117,7 +114,7 @@ __global__ void __launch_bounds__(kPrefilterThreads, kBlocksPerMultiprocessor)
       if (other < warp) at += listed_by_warp[other];
       listed_by_block += listed_by_warp[other];
     }
-    const std::int64_t base = before.sum_before<kPrefilterThreads>(turn, listed_by_block);
+    const int64_t base = before.sum_before<kPrefilterThreads>(turn, listed_by_block);
     if (turn == n_turns - 1 && threadIdx.x == 0) *kept.count = base + listed_by_block;
     for (int i = lane; i < n_listed; i += 32) {
       kept.views[base + at + i] = listed_views[warp][i];
@@ -134,8 +131,7 @@ constexpr int kSplatsOfBlock = 2 * kColorThreads;
 template <int DEGREE, bool QUADS>
 __device__ __forceinline__ void emit_color(const Inputs& in, const Camera<float>& camera,
                                            const Vec3<float>& mean, ShStage<DEGREE>& stage, int sh_slot,
-                                           const ProjectOutputs<float>& out, std::int64_t i,
-                                           std::int32_t id) {
+                                           const ProjectOutputs<float>& out, int64_t i, int32_t id) {
   bool shown = true;
   if constexpr (QUADS) {
     stage.wait();
@@ -144,8 +140,8 @@ __device__ __forceinline__ void emit_color(const Inputs& in, const Camera<float>
     stage.read(sh_slot, &sh);
     shown = splat_color(camera, mean, sh.values, DEGREE, out.colors + 3 * i);
   } else if (id >= 0) {
-    shown = splat_color(camera, mean, in.sh + 3 * in.options.sh_stride * std::int64_t{id}, DEGREE,
-                        out.colors + 3 * i);
+    shown =
+        splat_color(camera, mean, in.sh + 3 * in.options.sh_stride * int64_t{id}, DEGREE, out.colors + 3 * i);
   }
   if (shown) return;
   out.opacities[i] = 0.f;
@@ -165,16 +161,16 @@ __global__ void __launch_bounds__(kColorThreads, kColorBlocks)
   __shared__ TripleStage triples[kColorThreads / 32];
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   ShStage<DEGREE>& stage = stages[QUADS ? warp : 0];
-  const std::int64_t n_splats = capacity.fitting().splats, step = gridDim.x * std::int64_t{kSplatsOfBlock};
-  const std::int64_t block_start = blockIdx.x * std::int64_t{kSplatsOfBlock};
+  const int64_t n_splats = capacity.fitting().splats, step = gridDim.x * int64_t{kSplatsOfBlock};
+  const int64_t block_start = blockIdx.x * int64_t{kSplatsOfBlock};
   if (block_start >= n_splats) return;
   load_cameras(in, cameras);
   __syncthreads();
-  for (std::int64_t begin = block_start; begin < n_splats; begin += step) {
+  for (int64_t begin = block_start; begin < n_splats; begin += step) {
 #pragma unroll 1
     for (int first = 0; first < kSplatsOfBlock; first += kColorThreads) {
-      const std::int64_t i = begin + first + threadIdx.x;
-      const std::int32_t id = i < n_splats ? ids.gaussian_ids[i] : -1;
+      const int64_t i = begin + first + threadIdx.x;
+      const int32_t id = i < n_splats ? ids.gaussian_ids[i] : -1;
       int sh_slot = 0;
       if constexpr (QUADS) sh_slot = stage.gather(in.sh, 3 * in.options.sh_stride, id, lane);
       const int view = id < 0 ? 0 : ids.camera_ids[i];
@@ -185,10 +181,8 @@ __global__ void __launch_bounds__(kColorThreads, kColorBlocks)
   }
 }
 
-}  // namespace
-
 void prefilter(const Inputs& in, const Prefiltered& kept, Workspace& workspace, CudaStream stream) {
-  const std::int64_t turns = in.n_views > 0 ? most_prefilter_turns(in.n_candidates) : 0;
+  const int64_t turns = in.n_views > 0 ? most_prefilter_turns(in.n_candidates) : 0;
   if (turns == 0) {
     check(cudaMemsetAsync(kept.count, 0, sizeof(*kept.count), stream), "project");
     return;
@@ -198,8 +192,11 @@ void prefilter(const Inputs& in, const Prefiltered& kept, Workspace& workspace, 
   check_launch("project");
 }
 
-void write_colors(const Inputs& in, const ProjectCapacity& capacity, const ProjectColumns<float>& columns,
-                  CudaStream stream) {
+}  // namespace
+
+template <>
+void color_splats<float>(const Inputs& in, const ProjectCapacity& capacity,
+                         const ProjectColumns<float>& columns, CudaStream stream) {
   if (capacity.sizes.splats == 0 || !in.sh) return;
   const unsigned blocks = blocks_for(capacity.sizes.splats, kSplatsOfBlock);
   dispatch_sh(in, [&](auto degree, auto quads) {
@@ -211,14 +208,14 @@ void write_colors(const Inputs& in, const ProjectCapacity& capacity, const Proje
 
 template <>
 void project<float>(const Inputs& in, const RankTiles& rank_tiles, const ProjectSizes* capacity,
-                    const SplatMemory<float>& memory, std::int64_t* totals, Workspace& workspace,
+                    const SplatMemory<float>& memory, int64_t* totals, Workspace& workspace,
                     CudaStream stream) {
   const Prefiltered kept(in.n_candidates, workspace);
   prefilter(in, kept, workspace, stream);
   if (capacity) {
     const ProjectColumns<float> columns = memory(*capacity);
     write_splats(in, rank_tiles, kept, *capacity, columns, totals, workspace, stream);
-    write_colors(in, {*capacity, totals}, columns, stream);
+    color_splats(in, {*capacity, totals}, columns, stream);
     return;
   }
   write_splats(in, rank_tiles, kept, {0, 0}, {}, totals, workspace, stream);
@@ -226,13 +223,7 @@ void project<float>(const Inputs& in, const RankTiles& rank_tiles, const Project
   const auto sizes = read_back("project", reinterpret_cast<const ProjectSizes*>(totals), stream);
   const ProjectColumns<float> columns = memory(sizes);
   write_splats(in, rank_tiles, kept, sizes, columns, nullptr, workspace, stream);
-  write_colors(in, {sizes, nullptr}, columns, stream);
-}
-
-template <>
-void color_splats<float>(const Inputs& in, const ProjectCapacity& capacity,
-                         const ProjectColumns<float>& columns, CudaStream stream) {
-  write_colors(in, capacity, columns, stream);
+  color_splats(in, {sizes, nullptr}, columns, stream);
 }
 
 // The unscented projection.

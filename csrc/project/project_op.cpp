@@ -1,24 +1,20 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "project/project.h"
 
-#include <array>
-#include <tuple>
-
 #include "adam/lazy_adam_op.h"
-#include "common/op.h"
 #include "project/project_op.h"
 
 namespace blitzgs {
 namespace {
 
 RankTiles checked_rank_tiles(const IntList& begins_and_ends) {
-  const std::size_t n_ranks = begins_and_ends.size() / 2;
+  const size_t n_ranks = begins_and_ends.size() / 2;
   BLITZGS_CHECK(begins_and_ends.size() == 2 * n_ranks && n_ranks <= kMaxRanks,
                 "rank_tiles must have a begin and an end for each of at most ", kMaxRanks, " ranks, got ",
                 begins_and_ends.size(), " numbers");
   RankTiles ranks{};
-  ranks.n_ranks = static_cast<int>(n_ranks);
-  for (std::size_t m = 0; m < n_ranks; ++m) {
+  ranks.n_ranks = int(n_ranks);
+  for (size_t m = 0; m < n_ranks; ++m) {
     ranks.begin[m] = begins_and_ends[2 * m];
     ranks.end[m] = begins_and_ends[2 * m + 1];
   }
@@ -31,25 +27,24 @@ Tensors<14> project_fwd(const TensorList& gaussians, const Tensor& viewmats, con
                         const OptionalTensor& n_active, const OptionalTensor& n_blocks,
                         const OptionalTensor& ids, const OptionalTensor& level, BLITZGS_PROJECT_OPTIONS,
                         const FloatList& fade, const IntList& rank_tiles,
-                        std::optional<std::int64_t> visible_capacity,
-                        std::optional<std::int64_t> splat_capacity) {
+                        std::optional<int64_t> visible_capacity, std::optional<int64_t> splat_capacity) {
   const ProjectArguments p(gaussians, viewmats, Ks, checked_options(BLITZGS_PROJECT_OPTION_NAMES, fade), fade,
                            level);
   // Without active_ids, all Gaussians in all views are candidates.
   BLITZGS_CHECK(active_ids || (!active_views && !n_active && !n_blocks),
                 "active_views, n_active and n_blocks need active_ids");
-  const auto candidates = checked<std::int32_t>("active_ids", active_ids, {-1});
-  const std::int64_t length = candidates ? candidates->numel() : p.count;
-  const auto candidate_views = checked<std::int32_t>("active_views", active_views, {length}),
-             blocks = checked<std::int32_t>("n_blocks", n_blocks, {1});
-  const std::int64_t listed = max_listed(n_active, length);
+  const auto candidates = checked<int32_t>("active_ids", active_ids, {-1});
+  const int64_t length = candidates ? candidates->numel() : p.count;
+  const auto candidate_views = checked<int32_t>("active_views", active_views, {length}),
+             blocks = checked<int32_t>("n_blocks", n_blocks, {1});
+  const int64_t listed = max_listed(n_active, length);
   const RankTiles ranks = checked_rank_tiles(rank_tiles);
   BLITZGS_CHECK(visible_capacity.has_value() == splat_capacity.has_value() &&
                     visible_capacity.value_or(1) > 0 && splat_capacity.value_or(1) > 0,
                 "capacity must be how many visible Gaussians and splats there is room for, at least 1 each");
   const ProjectSizes capacity{visible_capacity.value_or(0), splat_capacity.value_or(0)};
-  const auto persistent = checked<std::int64_t>("ids", ids, {p.count});
-  const auto totals = make<std::int64_t>(p.means, {project_totals(p.n_views, ranks.n_ranks)});
+  const auto persistent = checked<int64_t>("ids", ids, {p.count});
+  const auto totals = make<int64_t>(p.means, {project_totals(p.n_views, ranks.n_ranks)});
   std::array<Tensor, 13> columns;
   DeviceScope scope(p.means);
   dispatch_floating(p.means, [&]<class T>() {
@@ -57,10 +52,10 @@ Tensors<14> project_fwd(const TensorList& gaussians, const Tensor& viewmats, con
     in.active_ids = candidates;
     in.active_views = candidate_views;
     in.n_candidates = listed;
-    in.n_active = data_or_null<std::int32_t>(n_active);
+    in.n_active = data_or_null<int32_t>(n_active);
     in.n_blocks = blocks;
     const auto memory = [&](const ProjectSizes& needed) -> ProjectColumns<T> {
-      const std::int64_t U = needed.visible, P = needed.splats;
+      const int64_t U = needed.visible, P = needed.splats;
       BLITZGS_CHECK(
           P <= INT32_MAX, P,
           " splats (Gaussians seen, summed over views) exceed 2^31 - 1; project fewer views at a time");
@@ -71,8 +66,8 @@ Tensors<14> project_fwd(const TensorList& gaussians, const Tensor& viewmats, con
         *next++ = values;
         return values;
       };
-      constexpr std::int32_t kInt = 0;
-      constexpr std::int64_t kLong = 0;
+      constexpr int32_t kInt = 0;
+      constexpr int64_t kLong = 0;
       constexpr T kReal = 0;
       // The braces guarantee the order of the calls.
       return {{add(kInt, {P}), add(kInt, {P}), add(kInt, {U}), add(kInt, {U + 1})},
@@ -90,7 +85,7 @@ Tensors<14> project_fwd(const TensorList& gaussians, const Tensor& viewmats, con
 // The outputs of the forward pass that both ops read, the weights of the regularisers for each view, and the
 // gradients of the splats. The object holds the tensors, so that the raw pointers stay valid.
 struct BackwardInputs {
-  Values<const std::int32_t> camera_ids, visible_ids, splat_offsets;
+  Values<const int32_t> camera_ids, visible_ids, splat_offsets;
   OptionalTensor scale_reg, opacity_reg, v_depths;
   TensorList v_splats;
 
@@ -98,14 +93,14 @@ struct BackwardInputs {
                  const Tensor& splat_offsets_in, const OptionalTensor& scale_reg_in,
                  const OptionalTensor& opacity_reg_in, const TensorList& v_splats_in,
                  const OptionalTensor& v_depths_in = std::nullopt)
-      : camera_ids(checked<std::int32_t>("camera_ids", camera_ids_in, {-1})),
-        visible_ids(checked<std::int32_t>("visible_ids", visible_ids_in, {-1})),
-        splat_offsets(checked<std::int32_t>("splat_offsets", splat_offsets_in, {visible() + 1})),
+      : camera_ids(checked<int32_t>("camera_ids", camera_ids_in, {-1})),
+        visible_ids(checked<int32_t>("visible_ids", visible_ids_in, {-1})),
+        splat_offsets(checked<int32_t>("splat_offsets", splat_offsets_in, {visible() + 1})),
         v_splats(v_splats_in) {
     const ScalarType dtype = p.means.scalar_type();
     scale_reg = checked("scale_reg", scale_reg_in, dtype, {p.n_views});
     opacity_reg = checked("opacity_reg", opacity_reg_in, dtype, {p.n_views});
-    const std::int64_t splats = camera_ids.numel();
+    const int64_t splats = camera_ids.numel();
     BLITZGS_CHECK(kOnCuda || !in_table(), "a table of gradients needs CUDA; give columns");
     if (in_table()) {
       BLITZGS_CHECK(!v_depths_in, "v_depths needs gradients in columns");
@@ -126,15 +121,12 @@ struct BackwardInputs {
   }
 
   bool in_table() const { return v_splats.size() == 1; }
-  std::int64_t visible() const { return visible_ids.numel(); }
+  int64_t visible() const { return visible_ids.numel(); }
   SplatIndex pointers() const { return {camera_ids, visible_ids, splat_offsets, visible()}; }
-  template <class T>
-  Regularisers<T> regularisers() const {
+  template <class T> Regularisers<T> regularisers() const {
     return {data_or_null<T>(scale_reg), data_or_null<T>(opacity_reg)};
   }
-  // Where the kernels read the gradients of the splats.
-  template <class T>
-  SplatGradientSource<T> gradients() const {
+  template <class T> SplatGradientSource<T> gradients() const {
 #ifdef BLITZGS_BACKEND_CUDA
     if (in_table())
       return PackedSplatGradients{reinterpret_cast<const SplatGradient*>(data<float>(v_splats[0]))};
@@ -155,7 +147,7 @@ Tensors<6> project_bwd(const TensorList& gaussians, const Tensor& viewmats, cons
                            level);
   const BackwardInputs b(p, camera_ids, visible_ids, splat_offsets, scale_reg, opacity_reg, v_splats,
                          v_depths);
-  const std::int64_t length = dense ? p.count : b.visible();
+  const int64_t length = dense ? p.count : b.visible();
   DeviceScope scope(p.means);
   return dispatch_floating(p.means, [&]<class T>() -> Tensors<6> {
     const auto v_means = make<T>(p.means, {length, 3}), v_quats = make<T>(p.means, {length, 4}),
@@ -177,12 +169,12 @@ Tensors<6> project_bwd(const TensorList& gaussians, const Tensor& viewmats, cons
   });
 }
 
-void project_bwd_step(const TensorList& state_in, const TensorList& tables, std::int64_t step,
-                      std::int64_t explicit_steps, double beta1, double beta2, double eps,
-                      const Tensor& viewmats, const Tensor& Ks, const OptionalTensor& scale_reg,
-                      const OptionalTensor& opacity_reg, const Tensor& camera_ids, const Tensor& visible_ids,
-                      const Tensor& splat_offsets, const OptionalTensor& level, BLITZGS_PROJECT_OPTIONS,
-                      const FloatList& fade, const TensorList& v_splats) {
+void project_bwd_step(const TensorList& state_in, const TensorList& tables, int64_t step,
+                      int64_t explicit_steps, double beta1, double beta2, double eps, const Tensor& viewmats,
+                      const Tensor& Ks, const OptionalTensor& scale_reg, const OptionalTensor& opacity_reg,
+                      const Tensor& camera_ids, const Tensor& visible_ids, const Tensor& splat_offsets,
+                      const OptionalTensor& level, BLITZGS_PROJECT_OPTIONS, const FloatList& fade,
+                      const TensorList& v_splats) {
   AdamTensors state(state_in, tables, {step, explicit_steps, beta1, beta2, eps});
   state.check_takes_step();
   const ProjectArguments p(state.params, viewmats, Ks, checked_options(BLITZGS_PROJECT_OPTION_NAMES, fade),

@@ -10,9 +10,9 @@
 namespace blitzgs {
 
 // The options of the projection as the ops take them, and as arguments of checked_options.
-#define BLITZGS_PROJECT_OPTIONS                                                            \
-  std::int64_t width, std::int64_t height, std::int64_t tile_size, std::int64_t sh_degree, \
-      double near_plane, double far_plane, double eps2d, double radius_clip, bool antialiased, bool raw
+#define BLITZGS_PROJECT_OPTIONS                                                                             \
+  int64_t width, int64_t height, int64_t tile_size, int64_t sh_degree, double near_plane, double far_plane, \
+      double eps2d, double radius_clip, bool antialiased, bool raw
 #define BLITZGS_PROJECT_OPTION_NAMES \
   width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw
 
@@ -28,10 +28,10 @@ inline ProjectOptions<double> checked_options(BLITZGS_PROJECT_OPTIONS, const Flo
                 "eps2d must be finite, and eps2d and radius_clip at least 0, got ", eps2d, " and ",
                 radius_clip);
   check_group("(fade_slope, reach of each level)", fade, 0, 1 + kMaxLevels);
-  return {static_cast<int>(width),
-          static_cast<int>(height),
-          static_cast<int>(tile_size),
-          static_cast<int>(sh_degree),
+  return {int(width),
+          int(height),
+          int(tile_size),
+          int(sh_degree),
           /*sh_stride=*/0,
           near_plane,
           far_plane,
@@ -48,11 +48,11 @@ inline void set_fade(const Tensor& level, const FloatList& numbers, LevelFade& f
   BLITZGS_CHECK(numbers.size() > 1 && numbers[0] >= 1,
                 "levels need a fade_slope of at least 1 and a reach for each level in fade, got ",
                 numbers.size(), " floats");
-  fade.level = data<std::uint8_t>(level);
-  fade.n_levels = static_cast<int>(numbers.size()) - 1;
+  fade.level = data<uint8_t>(level);
+  fade.n_levels = int(numbers.size()) - 1;
   for (int i = 0; i < fade.n_levels; ++i) {
     const double reach = numbers[1 + i];
-    fade.inverse_reach2[i] = reach > 0 ? static_cast<float>(1.0 / (reach * reach)) : FLT_MAX;
+    fade.inverse_reach2[i] = reach > 0 ? float(1.0 / (reach * reach)) : FLT_MAX;
   }
 }
 
@@ -61,7 +61,7 @@ inline void set_fade(const Tensor& level, const FloatList& numbers, LevelFade& f
 struct ProjectArguments {
   Tensor means, quats, scales, opacities, viewmats, Ks;
   OptionalTensor sh, level;
-  std::int64_t count, n_views, sh_stride = 0;
+  int64_t count, n_views, sh_stride = 0;
   ProjectOptions<double> options;
   LevelFade fade{};
 
@@ -89,8 +89,7 @@ struct ProjectArguments {
     if (level) set_fade(*level, numbers, fade);
   }
 
-  template <class T>
-  ProjectInputs<T> inputs() const {
+  template <class T> ProjectInputs<T> inputs() const {
     const ProjectOptions<double>& o = options;
     return {data<T>(means),
             data<T>(quats),
@@ -102,10 +101,9 @@ struct ProjectArguments {
             nullptr,
             nullptr,
             count,
-            static_cast<int>(n_views),
-            {o.width, o.height, o.tile_size, o.sh_degree, o.sh_stride, static_cast<T>(o.near_plane),
-             static_cast<T>(o.far_plane), static_cast<T>(o.eps2d), static_cast<T>(o.radius_clip),
-             o.antialiased, o.raw, static_cast<T>(o.fade_slope)},
+            int(n_views),
+            {o.width, o.height, o.tile_size, o.sh_degree, o.sh_stride, T(o.near_plane), T(o.far_plane),
+             T(o.eps2d), T(o.radius_clip), o.antialiased, o.raw, T(o.fade_slope)},
             nullptr,
             fade};
   }
@@ -114,7 +112,7 @@ struct ProjectArguments {
   void set_sh(const Tensor& sh_in) {
     sh = checked("sh", sh_in, means.scalar_type(), {count, -1, 3});
     sh_stride = sh->size(1);
-    options.sh_stride = static_cast<int>(sh_stride);
+    options.sh_stride = int(sh_stride);
     BLITZGS_CHECK(options.sh_degree >= 0 && options.sh_degree <= kMaxShDegree,
                   "sh_degree must be 0 to 3, got ", options.sh_degree);
     BLITZGS_CHECK(sh_basis_count(options.sh_degree) <= sh_stride, "sh has ", sh_stride,

@@ -1,12 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // The arithmetic of one splat, a Gaussian projected into a view, forward and backward (docs/image.md,
-// sections 1, 2 and 4). Both backends call these functions, so they compute the same splat. CUDA forward
-// kernels must be compiled without FMA contraction, because two launches that project the same splat
-// (counting, then writing) must get the same bits.
+// sections 1, 2 and 4), for both backends. CUDA forward kernels are compiled without FMA contraction, because
+// two launches that project the same splat must get the same bits.
 #pragma once
-#include <cstdint>
-
-#include "common/kernel.h"
 #include "math/frustum.h"
 #include "math/gaussian.h"
 #include "math/projection.h"
@@ -14,8 +10,7 @@
 
 namespace blitzgs {
 
-template <class T>
-struct ProjectOptions {
+template <class T> struct ProjectOptions {
   int width, height, tile_size;
   int sh_degree, sh_stride;  // sh_stride: coefficients stored per Gaussian, K
   T near_plane, far_plane, eps2d, radius_clip;
@@ -24,8 +19,7 @@ struct ProjectOptions {
 };
 
 // A Gaussian after activation (docs/image.md, section 1). All its splats use the same one.
-template <class T>
-struct ActivatedGaussian {
+template <class T> struct ActivatedGaussian {
   Vec3<T> mean, scale;
   UnitQuaternion<T> quat;
   Columns3<T> rotation, axes;
@@ -33,27 +27,23 @@ struct ActivatedGaussian {
   T inverse_reach2;  // 1 / reach^2 of its level (project.h); 0: the Gaussian does not fade
 };
 
-template <class T>
-struct Splat {
+template <class T> struct Splat {
   T mean2d[2], conic[3], depth, opacity;
   T extent[2];  // half width and height of the box around alpha >= 1/255, px
 };
 
-template <class T>
-BLITZGS_HD Vec3<T> activate_scale(const T* scale, bool raw) {
+template <class T> BLITZGS_HD Vec3<T> activate_scale(const T* scale, bool raw) {
   if (!raw) return load3(scale);
   return {std::exp(scale[0]), std::exp(scale[1]), std::exp(scale[2])};
 }
 
-template <class T>
-BLITZGS_HD T activate_opacity(T opacity, bool raw) {
+template <class T> BLITZGS_HD T activate_opacity(T opacity, bool raw) {
   return raw ? sigmoid(opacity) : opacity;
 }
 
 // The largest distance from the centre, in standard deviations, at which a splat of this opacity has
 // alpha >= 1/255; negative if alpha is smaller everywhere.
-template <class T>
-BLITZGS_HD T visible_sigmas(T opacity) {
+template <class T> BLITZGS_HD T visible_sigmas(T opacity) {
   return opacity >= T(kAlphaCut) && is_finite(opacity)
              ? std::sqrt(T(2) * std::log(larger(T(255) * opacity, T(1))))
              : T(-1);
@@ -65,13 +55,11 @@ BLITZGS_HD bool touches_image(const T* mean2d, T half_x, T half_y, const Project
          mean2d[1] - half_y < T(options.height);
 }
 
-template <class T>
-BLITZGS_HD bool in_depth_range(T depth, const ProjectOptions<T>& options) {
+template <class T> BLITZGS_HD bool in_depth_range(T depth, const ProjectOptions<T>& options) {
   return depth > options.near_plane && depth <= options.far_plane;
 }
 
-template <class T>
-BLITZGS_HD Frustum frustum_of(const Camera<T>& camera, const ProjectOptions<T>& options) {
+template <class T> BLITZGS_HD Frustum frustum_of(const Camera<T>& camera, const ProjectOptions<T>& options) {
   return make_frustum(camera, options.width, options.height, options.near_plane, options.far_plane,
                       options.eps2d);
 }
@@ -98,9 +86,8 @@ BLITZGS_HD T level_weight(const Camera<T>& camera, const ActivatedGaussian<T>& g
   return smaller(larger(slope - slope * gaussian.inverse_reach2 * dot(offset, offset), T(0)), T(1));
 }
 
-template <class T>
-BLITZGS_HD std::int32_t pixel_radius(T extent) {
-  return static_cast<std::int32_t>(std::ceil(smaller(extent, T(1 << 30))));
+template <class T> BLITZGS_HD int32_t pixel_radius(T extent) {
+  return int32_t(std::ceil(smaller(extent, T(1 << 30))));
 }
 
 // Sets the extent of a splat whose other values are known. Returns false if the splat does not exist.
@@ -137,22 +124,21 @@ BLITZGS_HD bool project_splat(const Camera<T>& camera, const ActivatedGaussian<T
 // Returns the number of tiles that a splat touches and sets *ranks to the ranks (as bits) that composite some
 // of them. Calls f(rank, number of tiles) for each piece of a tile row that one rank composites.
 template <class T, class F>
-BLITZGS_HD std::int32_t splat_tiles(const Splat<T>& splat, int view, const ProjectOptions<T>& options,
-                                    const RankTiles& rank_tiles, std::int64_t* ranks, const F& f) {
+BLITZGS_HD int32_t splat_tiles(const Splat<T>& splat, int view, const ProjectOptions<T>& options,
+                               const RankTiles& rank_tiles, int64_t* ranks, const F& f) {
   const int tiles_x = (options.width + options.tile_size - 1) / options.tile_size;
   const int tiles_y = (options.height + options.tile_size - 1) / options.tile_size;
-  const std::int64_t image = static_cast<std::int64_t>(view) * tiles_x * tiles_y;
-  std::int32_t count = 0;
-  std::int64_t wanted = 0;
+  const int64_t image = int64_t(view) * tiles_x * tiles_y;
+  int32_t count = 0;
+  int64_t wanted = 0;
   for_each_tile_row(splat.mean2d, splat.conic, splat.opacity, options.width, options.height,
                     options.tile_size, [&](int ty, int begin, int end) {
                       count += end - begin;
-                      const std::int64_t first = image + static_cast<std::int64_t>(ty) * tiles_x;
-                      for_each_rank(rank_tiles, first + begin, first + end,
-                                    [&](int rank, std::int64_t tiles) {
-                                      wanted |= std::int64_t{1} << rank;
-                                      f(rank, tiles);
-                                    });
+                      const int64_t first = image + int64_t(ty) * tiles_x;
+                      for_each_rank(rank_tiles, first + begin, first + end, [&](int rank, int64_t tiles) {
+                        wanted |= int64_t{1} << rank;
+                        f(rank, tiles);
+                      });
                     });
   *ranks = wanted;
   return count;
@@ -169,15 +155,13 @@ BLITZGS_HD T view_direction(const Camera<T>& camera, const Vec3<T>& mean, Vec3<T
 }
 
 // sum_k basis_k sh_k + 0.5; sh [K, 3].
-template <class T>
-BLITZGS_HD Vec3<T> unclipped_color(const T* basis, const T* sh, int degree) {
+template <class T> BLITZGS_HD Vec3<T> unclipped_color(const T* basis, const T* sh, int degree) {
   Vec3<T> sum{T(0.5), T(0.5), T(0.5)};
   for (int k = 0; k < sh_basis_count(degree); ++k) sum = mul_add(basis[k], load3(sh + 3 * k), sum);
   return sum;
 }
 
-template <class T>
-BLITZGS_HD bool finite_color(const Vec3<T>& color) {
+template <class T> BLITZGS_HD bool finite_color(const Vec3<T>& color) {
   return is_finite(color.x) && is_finite(color.y) && is_finite(color.z);
 }
 
@@ -218,14 +202,11 @@ BLITZGS_HD void splat_color_vjp(const Camera<T>& camera, const Vec3<T>& mean, co
   if (pose) camera_centre_vjp(camera, T(-1) * v_offset, pose);
 }
 
-template <class T>
-struct GeometryGradient {
+template <class T> struct GeometryGradient {
   T mean2d[2], conic[3], depth, opacity;
 };
 
-// Gradients of an activated Gaussian, summed over its splats.
-template <class T>
-struct GaussianGradient {
+template <class T> struct GaussianGradient {
   Vec3<T> mean;
   Columns3<T> axes;
   T opacity;
@@ -250,8 +231,7 @@ BLITZGS_HD void project_splat_vjp(const Camera<T>& camera, const ActivatedGaussi
 }
 
 // Adds the gradient of weight * min_j s_j (BlitzGS, L_scale). Of equal axes the first one gets it.
-template <class T>
-BLITZGS_HD void smallest_axis_vjp(const Vec3<T>& scale, T weight, Vec3<T>* v_scale) {
+template <class T> BLITZGS_HD void smallest_axis_vjp(const Vec3<T>& scale, T weight, Vec3<T>* v_scale) {
   if (scale.x <= scale.y && scale.x <= scale.z) {
     v_scale->x += weight;
   } else if (scale.y <= scale.z) {
@@ -261,15 +241,12 @@ BLITZGS_HD void smallest_axis_vjp(const Vec3<T>& scale, T weight, Vec3<T>* v_sca
   }
 }
 
-// Pointers to one Gaussian's rows of the gradient outputs.
-template <class T>
-struct ParameterGradients {
+template <class T> struct ParameterGradients {
   T *mean, *quat, *scale, *opacity;
 };
 
 // Takes the gradients of the activated Gaussian back to the stored parameters (log scales and logit if raw)
-// and writes them to `out`. axis_weight: the weight of the smallest axis in the regularisers, summed over the
-// splats.
+// and writes them to `out`. axis_weight: the regularisers' weight of the smallest axis, over the splats.
 template <class T>
 BLITZGS_HD void activate_gaussian_vjp(const ActivatedGaussian<T>& gaussian, bool raw,
                                       const GaussianGradient<T>& gradient, T axis_weight,

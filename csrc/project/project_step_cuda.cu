@@ -5,7 +5,6 @@
 #include "project/project_bwd_device.cuh"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 constexpr int kPacks = 12;  // packs of four floats in an SH row of degree 3
@@ -16,11 +15,11 @@ constexpr int kBatch = 4;   // packs that a lane has in flight
 struct StepRows {
   struct Shared {
     AdamStep<float> step;
-    std::int32_t ids[kBackwardThreads];
+    int32_t ids[kBackwardThreads];
     Decay decays[kBackwardThreads];
   };
   struct Own {
-    std::int32_t behind;  // pending steps by which the moments of this lane's Gaussian must decay first
+    int32_t behind;  // pending steps by which the moments of this lane's Gaussian must decay first
   };
   AdamArgs<float> adam;
 
@@ -33,8 +32,7 @@ struct StepRows {
   __device__ void take(Shared& shared, const Own& own, const WarpRows& warp, TripleStage& triple,
                        const Vec3<float>& v_mean, const float4& v_quat, const Vec3<float>& v_scale,
                        float v_opacity) const {
-    // Initialised because the compiler would keep these on the stack if lanes without a Gaussian left them
-    // undefined.
+    // Initialised, because the compiler would keep on the stack what lanes without a Gaussian left undefined.
     StepPack<0, 1> means[3]{};
     StepPack<1, 4> quat{};
     StepPack<2, 1> scales[3]{};

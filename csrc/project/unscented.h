@@ -2,18 +2,16 @@
 // The unscented projection (3DGUT, Wu et al. 2025; the transform of Wan and van der Merwe 2000): splats of
 // Gaussians in views with a distorting lens or a rolling shutter (math/lens.h), and the derivative.
 //
-// With P(x) the pixel of a world point x, the mean mu and the axes a_i of a Gaussian, n = alpha^2 (3 +
-// kappa):
+// With P(x) the pixel of a world point x, the mean mu and axes a_i of a Gaussian, n = alpha^2 (3 + kappa):
 //   d_i = P(mu +- sqrt(n) a_i) - P(mu),   w = 1 / (2 n),   D = w sum d_i
 //   mean2d = P(mu) + D,   Sigma' = w sum d_i d_i^T + (beta - alpha^2) D D^T + eps2d I
-// These are the sums over seven weighted sigma points, of which the first has the weight 1 - 3 / n = -99,
-// without their cancellation; in double, because the d_i are small differences of pixels. Depth is z at the
-// pose in the middle of the frame, and colours are those from viewmats. A splat exists if one of its points,
-// or each (all_valid), is valid, and by the rules of project.h.
+// These are the sums over seven weighted sigma points without their cancellation (the first has the weight 1
+// - 3 / n = -99), in double, because the d_i are small differences of pixels. Depth is z at the pose in the
+// middle of the frame, and colours are those from viewmats. A splat exists if one of its points, or each
+// (all_valid), is valid, and by the rules of project.h.
 //
-// One thread for each pair of N Gaussians and B views finds which are splats, one for each splat computes it,
-// and one for each Gaussian sums the gradients of its splats in order, so that their bits are always the
-// same.
+// One thread for each pair of a Gaussian and a view finds which are splats, one for each splat computes it,
+// and one for each Gaussian sums the gradients of its splats in order.
 #pragma once
 #include "math/lens.h"
 #include "project/project.h"
@@ -162,8 +160,7 @@ BLITZGS_HD void unscented_splat_vjp(const LensCamera& camera, const ActivatedGau
 
 // What the three passes below read. lenses [B, kLensNumbers]; viewmats_rs [B, 4, 4], the poses at the end of
 // the frame, null for a global shutter.
-template <class T>
-struct UnscentedInputs {
+template <class T> struct UnscentedInputs {
   ProjectInputs<T> in;
   const T *lenses, *viewmats_rs;
   UnscentedOptions options;
@@ -173,7 +170,7 @@ struct UnscentedInputs {
                             lenses + kLensNumbers * view, options.shutter, in.viewmats + 16 * view,
                             viewmats_rs ? viewmats_rs + 16 * view : nullptr);
   }
-  BLITZGS_HD ActivatedGaussian<double> gaussian(std::int64_t id) const {
+  BLITZGS_HD ActivatedGaussian<double> gaussian(int64_t id) const {
     const T *m = in.means + 3 * id, *q = in.quats + 4 * id, *s = in.scales + 3 * id;
     const double quat[4] = {q[0], q[1], q[2], q[3]}, scale[3] = {s[0], s[1], s[2]};
     return activate_gaussian(Vec3<double>{m[0], m[1], m[2]}, quat, activate_scale(scale, in.options.raw),
@@ -182,14 +179,13 @@ struct UnscentedInputs {
 };
 
 // Row i: whether Gaussian i / B has a splat in view i % B; seen [N, B].
-template <class T>
-struct UnscentedVisible {
+template <class T> struct UnscentedVisible {
   UnscentedInputs<T> inputs;
   bool* seen;
-  std::int64_t n;
+  int64_t n;
 
-  BLITZGS_HD void operator()(std::int64_t i) const {
-    const int view = static_cast<int>(i % inputs.in.n_views);
+  BLITZGS_HD void operator()(int64_t i) const {
+    const int view = int(i % inputs.in.n_views);
     Splat<T> splat;
     seen[i] = unscented_splat(inputs.camera(view), inputs.gaussian(i / inputs.in.n_views), inputs.in.options,
                               inputs.options, &splat);
@@ -197,16 +193,15 @@ struct UnscentedVisible {
 };
 
 // Row i: the values of splat i, of Gaussian gaussian_ids[i] in view camera_ids[i].
-template <class T>
-struct UnscentedSplats {
+template <class T> struct UnscentedSplats {
   UnscentedInputs<T> inputs;
-  const std::int32_t *gaussian_ids, *camera_ids;
+  const int32_t *gaussian_ids, *camera_ids;
   ProjectOutputs<T> out;
-  std::int64_t n;
+  int64_t n;
 
-  BLITZGS_HD void operator()(std::int64_t i) const {
+  BLITZGS_HD void operator()(int64_t i) const {
     const ProjectInputs<T>& in = inputs.in;
-    const std::int64_t id = gaussian_ids[i];
+    const int64_t id = gaussian_ids[i];
     const int view = camera_ids[i];
     Splat<T> splat{};
     bool shown =
@@ -216,9 +211,8 @@ struct UnscentedSplats {
                           in.options.sh_degree, out.colors + 3 * i) &&
               shown;
     }
-    std::int64_t ranks;
-    const std::int32_t tiles =
-        splat_tiles(splat, 0, in.options, RankTiles{}, &ranks, [](int, std::int64_t) {});
+    int64_t ranks;
+    const int32_t tiles = splat_tiles(splat, 0, in.options, RankTiles{}, &ranks, [](int, int64_t) {});
     for (int k = 0; k < 2; ++k) {
       out.means2d[2 * i + k] = splat.mean2d[k];
       out.radii[2 * i + k] = shown ? pixel_radius(splat.extent[k]) : 0;
@@ -232,24 +226,23 @@ struct UnscentedSplats {
 
 // Row i: the gradients of Gaussian i of N, whose splats are offsets[i] to offsets[i + 1] - 1; zeros if it has
 // none. offsets [N + 1]. The outputs have a row for each Gaussian; viewmats get none.
-template <class T>
-struct UnscentedGradients {
+template <class T> struct UnscentedGradients {
   UnscentedInputs<T> inputs;
-  const std::int32_t *camera_ids, *offsets;
+  const int32_t *camera_ids, *offsets;
   SplatGradientColumns<T> v;
   ProjectGradients<T> out;
-  std::int64_t n;
+  int64_t n;
 
-  BLITZGS_HD void operator()(std::int64_t i) const {
+  BLITZGS_HD void operator()(int64_t i) const {
     const ProjectInputs<T>& in = inputs.in;
-    const std::int64_t stride = 3 * in.options.sh_stride;
-    for (std::int64_t k = 0; in.sh && k < stride; ++k) out.sh[stride * i + k] = T(0);
+    const int64_t stride = 3 * in.options.sh_stride;
+    for (int64_t k = 0; in.sh && k < stride; ++k) out.sh[stride * i + k] = T(0);
     double mean[3] = {}, quat[4] = {}, scale[3] = {}, opacity = 0;
     if (offsets[i] < offsets[i + 1]) {
       const ActivatedGaussian<double> gaussian = inputs.gaussian(i);
       GaussianGradient<double> gradient{};
       Vec3<T> v_mean{};
-      for (std::int64_t r = offsets[i]; r < offsets[i + 1]; ++r) {
+      for (int64_t r = offsets[i]; r < offsets[i + 1]; ++r) {
         const int view = camera_ids[r];
         unscented_splat_vjp(inputs.camera(view), gaussian, in.options, inputs.options, v.geometry(r),
                             &gradient);

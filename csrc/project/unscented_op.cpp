@@ -1,9 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "project/unscented.h"
 
-#include <cmath>
-
-#include "common/op.h"
 #include "project/project_op.h"
 
 namespace blitzgs {
@@ -19,13 +16,12 @@ struct UnscentedArguments {
   // transform: alpha, beta, kappa, margin, and whether all points have to be valid.
   UnscentedArguments(const TensorList& gaussians, const Tensor& viewmats, const Tensor& Ks,
                      const Tensor& lenses_in, const OptionalTensor& viewmats_rs_in, bool fisheye,
-                     std::int64_t shutter, const FloatList& transform, const ProjectOptions<double>& image)
+                     int64_t shutter, const FloatList& transform, const ProjectOptions<double>& image)
       : p(gaussians, viewmats, Ks, image) {
     const ScalarType dtype = p.means.scalar_type();
     lenses = checked("lenses", lenses_in, dtype, {p.n_views, kLensNumbers});
     viewmats_rs = checked("viewmats_rs", viewmats_rs_in, dtype, {p.n_views, 4, 4});
-    BLITZGS_CHECK(shutter >= 0 && shutter <= static_cast<int>(Shutter::kGlobal),
-                  "shutter must be 0 to 4, got ", shutter);
+    BLITZGS_CHECK(shutter >= 0 && shutter <= int(Shutter::kGlobal), "shutter must be 0 to 4, got ", shutter);
     options.shutter = static_cast<Shutter>(shutter);
     BLITZGS_CHECK(viewmats_rs.has_value() == (options.shutter != Shutter::kGlobal),
                   "a rolling shutter needs viewmats_rs, and a global one (4) none");
@@ -40,15 +36,14 @@ struct UnscentedArguments {
     options.beyond = transform[1] - alpha2;
   }
 
-  template <class T>
-  UnscentedInputs<T> inputs() const {
+  template <class T> UnscentedInputs<T> inputs() const {
     return {p.inputs<T>(), data<T>(lenses), data_or_null<T>(viewmats_rs), options};
   }
 };
 
-#define BLITZGS_UNSCENTED                                                                                \
-  const TensorList &gaussians, const Tensor &viewmats, const Tensor &Ks, const Tensor &lenses,           \
-      const OptionalTensor &viewmats_rs, bool fisheye, std::int64_t shutter, const FloatList &transform, \
+#define BLITZGS_UNSCENTED                                                                           \
+  const TensorList &gaussians, const Tensor &viewmats, const Tensor &Ks, const Tensor &lenses,      \
+      const OptionalTensor &viewmats_rs, bool fisheye, int64_t shutter, const FloatList &transform, \
       BLITZGS_PROJECT_OPTIONS
 #define BLITZGS_UNSCENTED_CHECKED                                            \
   gaussians, viewmats, Ks, lenses, viewmats_rs, fisheye, shutter, transform, \
@@ -56,7 +51,7 @@ struct UnscentedArguments {
 
 Tensor unscented_visible(BLITZGS_UNSCENTED) {
   const UnscentedArguments a(BLITZGS_UNSCENTED_CHECKED);
-  const std::int64_t rows = a.p.count * a.p.n_views;
+  const int64_t rows = a.p.count * a.p.n_views;
   const auto seen = make<bool>(a.p.means, {a.p.count, a.p.n_views});
   dispatch_floating(a.p.means,
                     [&]<class T>() { run_rows(a.p.means, UnscentedVisible<T>{a.inputs<T>(), seen, rows}); });
@@ -66,11 +61,11 @@ Tensor unscented_visible(BLITZGS_UNSCENTED) {
 Tensors<7> unscented_fwd(BLITZGS_UNSCENTED, const Tensor& gaussian_ids_in, const Tensor& camera_ids_in,
                          const Tensor&) {
   const UnscentedArguments a(BLITZGS_UNSCENTED_CHECKED);
-  const auto gaussian_ids = checked<std::int32_t>("gaussian_ids", gaussian_ids_in, {-1});
-  const std::int64_t P = gaussian_ids.numel();
-  const auto camera_ids = checked<std::int32_t>("camera_ids", camera_ids_in, {P});
+  const auto gaussian_ids = checked<int32_t>("gaussian_ids", gaussian_ids_in, {-1});
+  const int64_t P = gaussian_ids.numel();
+  const auto camera_ids = checked<int32_t>("camera_ids", camera_ids_in, {P});
   const Tensor& like = a.p.means;
-  const auto radii = make<std::int32_t>(like, {P, 2}), tiles = make<std::int32_t>(like, {P});
+  const auto radii = make<int32_t>(like, {P, 2}), tiles = make<int32_t>(like, {P});
   return dispatch_floating(like, [&]<class T>() -> Tensors<7> {
     const auto means2d = make<T>(like, {P, 2}), conics = make<T>(like, {P, 3}), depths = make<T>(like, {P}),
                opacities = make<T>(like, {P}), colors = make<T>(like, {a.p.sh ? P : 0, 3});
@@ -85,12 +80,12 @@ Tensors<7> unscented_fwd(BLITZGS_UNSCENTED, const Tensor& gaussian_ids_in, const
 Tensors<5> unscented_bwd(BLITZGS_UNSCENTED, const Tensor& camera_ids_in, const Tensor& offsets_in,
                          const TensorList& v_splats) {
   const UnscentedArguments a(BLITZGS_UNSCENTED_CHECKED);
-  const std::int64_t N = a.p.count;
-  const auto camera_ids = checked<std::int32_t>("camera_ids", camera_ids_in, {-1}),
-             offsets = checked<std::int32_t>("splat_offsets", offsets_in, {N + 1});
-  const std::int64_t P = camera_ids.numel();
+  const int64_t N = a.p.count;
+  const auto camera_ids = checked<int32_t>("camera_ids", camera_ids_in, {-1}),
+             offsets = checked<int32_t>("splat_offsets", offsets_in, {N + 1});
+  const int64_t P = camera_ids.numel();
   const Tensor& like = a.p.means;
-  const std::size_t columns = a.p.sh ? 5 : 4;
+  const size_t columns = a.p.sh ? 5 : 4;
   check_group("(v_means2d, v_conics, v_depths, v_opacities[, v_colors])", v_splats, columns, columns);
   return dispatch_floating(like, [&]<class T>() -> Tensors<5> {
     const auto v_means2d = checked<T>("v_means2d", v_splats[0], {P, 2}),

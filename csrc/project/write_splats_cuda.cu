@@ -2,13 +2,10 @@
 // Kernel 2 of the projection (project.h): projects the pairs of a Gaussian and a view that the prefilter
 // kept, decides which of them are splats, and writes the splats in order. Compiled without FMA contraction
 // (cmake/cuda.cmake), because a splat that is projected in two launches must get the same bits in both.
-#include <algorithm>
 
-#include "common/cuda.cuh"
 #include "project/project_device.cuh"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 constexpr int kWarps = kSplatThreads / 32, kBlocksPerMultiprocessor = 6;
@@ -25,7 +22,6 @@ struct Sums {
   }
 };
 
-// Adds a block's sums to the totals of the launch.
 __device__ void store_sums(const Sums& sums, const Inputs& in, int n_ranks, unsigned long long* totals) {
   const int thread = threadIdx.x;
   if (thread == 0) {
@@ -44,49 +40,44 @@ __device__ void store_sums(const Sums& sums, const Inputs& in, int n_ranks, unsi
   }
 }
 
-constexpr std::uint16_t kNoSplat = 0xffff;
+constexpr uint16_t kNoSplat = 0xffff;
 
 // The splats of a turn in shared memory, by pair, until the block knows their positions in the output.
 struct Pending {
   float2 means2d[kMaxPairs];
   float conics[3][kMaxPairs], depths[kMaxPairs], opacities[kMaxPairs];
   int2 radii[kMaxPairs];
-  std::int32_t tiles[kMaxPairs];
-  std::int64_t ranks[kMaxPairs];
-  std::uint16_t pairs[kMaxPairs];  // kMaxViews * (slot in the group) + view; kNoSplat: not a splat
+  int32_t tiles[kMaxPairs];
+  int64_t ranks[kMaxPairs];
+  uint16_t pairs[kMaxPairs];  // kMaxViews * (slot in the group) + view; kNoSplat: not a splat
 };
 
 // Returns the number of tiles of a splat, sets *ranks to the ranks that composite some of them, and adds the
 // splat and its tiles to the sums of these ranks.
-__device__ __forceinline__ std::int32_t find_tiles(const Splat<float>& splat, int view, const Inputs& in,
-                                                   const RankTiles& rank_tiles, std::int64_t* ranks,
-                                                   Sums& sums) {
+__device__ __forceinline__ int32_t find_tiles(const Splat<float>& splat, int view, const Inputs& in,
+                                              const RankTiles& rank_tiles, int64_t* ranks, Sums& sums) {
   int current = -1;            // the rank of the last pieces of tile rows
   unsigned tiles_of_rank = 0;  // tiles of these pieces: few splats have several ranks, so this saves atomics
-  const std::int32_t tiles =
-      splat_tiles(splat, view, in.options, rank_tiles, ranks, [&](int rank, std::int64_t count) {
-        if (rank != current) {
-          if (current >= 0) sums.add_tiles(current, tiles_of_rank);
-          current = rank;
-          tiles_of_rank = 0;
-        }
-        tiles_of_rank += static_cast<unsigned>(count);
-      });
+  const int32_t tiles = splat_tiles(splat, view, in.options, rank_tiles, ranks, [&](int rank, int64_t count) {
+    if (rank != current) {
+      if (current >= 0) sums.add_tiles(current, tiles_of_rank);
+      current = rank;
+      tiles_of_rank = 0;
+    }
+    tiles_of_rank += unsigned(count);
+  });
   if (current >= 0) sums.add_tiles(current, tiles_of_rank);
-  for (std::int64_t rest = *ranks; rest; rest &= rest - 1) {
-    atomicAdd(&sums.rank_splats[__ffsll(rest) - 1], 1u);
-  }
+  for (int64_t rest = *ranks; rest; rest &= rest - 1) atomicAdd(&sums.rank_splats[__ffsll(rest) - 1], 1u);
   return tiles;
 }
 
-// The Gaussians of a turn, which a block projects together.
 struct Group {
-  std::uint32_t seen[kSplatThreads];  // the views in which each has a splat, as bits
-  std::int32_t ids[kSplatThreads];
-  std::int32_t before[kSplatThreads];  // of the Gaussians before it in the group: visible << 16 | splats
+  uint32_t seen[kSplatThreads];  // the views in which each has a splat, as bits
+  int32_t ids[kSplatThreads];
+  int32_t before[kSplatThreads];  // of the Gaussians before it in the group: visible << 16 | splats
   int warp_sums[kWarps];
   int next_turn;
-  std::int64_t before_turn;  // of all turns before: visible << 31 | splats
+  int64_t before_turn;  // of all turns before: visible << 31 | splats
 };
 
 // Returns the sum of `value` over the threads before this one and sets *all to the sum over the block. It
@@ -107,32 +98,31 @@ __device__ __forceinline__ int sum_of_threads_before(int value, Group& group, in
 }
 
 // Writes the last entry of splat_offsets, the total number of splats. all: visible << 31 | splats.
-__device__ __forceinline__ void end_splats(std::int64_t all, const ProjectSizes& capacity,
-                                           const ProjectIds& ids) {
-  const std::int64_t visible = all >> 31;
+__device__ __forceinline__ void end_splats(int64_t all, const ProjectSizes& capacity, const ProjectIds& ids) {
+  const int64_t visible = all >> 31;
   if (capacity.splats > 0 && visible <= capacity.visible) {
-    ids.splat_offsets[visible] = static_cast<std::int32_t>(all & 0x7fffffff);
+    ids.splat_offsets[visible] = int32_t(all & 0x7fffffff);
   }
 }
 
 // Writes the visible Gaussians and splats of a group, up to the capacity. before: visible << 31 | splats of
 // all turns before.
-__device__ __forceinline__ void write_splats(const Group& group, std::int64_t before, const Pending& pending,
+__device__ __forceinline__ void write_splats(const Group& group, int64_t before, const Pending& pending,
                                              int n_pairs, const ProjectSizes& capacity, const ProjectIds& ids,
                                              const ProjectOutputs<float>& out) {
   const int thread = threadIdx.x;
-  const std::int64_t visible_before = before >> 31, splats_before = before & 0x7fffffff;
-  const std::int32_t in_group = group.before[thread];
-  const std::int64_t u = visible_before + (in_group >> 16);
+  const int64_t visible_before = before >> 31, splats_before = before & 0x7fffffff;
+  const int32_t in_group = group.before[thread];
+  const int64_t u = visible_before + (in_group >> 16);
   if (group.seen[thread] && u < capacity.visible) {
     ids.visible_ids[u] = group.ids[thread];
-    ids.splat_offsets[u] = static_cast<std::int32_t>(splats_before + (in_group & 0xffff));
+    ids.splat_offsets[u] = int32_t(splats_before + (in_group & 0xffff));
   }
   for (int p = thread; p < n_pairs; p += kSplatThreads) {
     const int pair = pending.pairs[p], slot = pair / kMaxViews, view = pair % kMaxViews;
     if (pair == kNoSplat) continue;
-    const std::uint32_t views_of_slot = group.seen[slot];
-    const std::int64_t i =
+    const uint32_t views_of_slot = group.seen[slot];
+    const int64_t i =
         splats_before + (group.before[slot] & 0xffff) + __popc(views_of_slot & ((1u << view) - 1u));
     if (i >= capacity.splats) continue;
     ids.gaussian_ids[i] = group.ids[slot];
@@ -150,12 +140,9 @@ __device__ __forceinline__ void write_splats(const Group& group, std::int64_t be
 
 // Projects the Gaussians that the prefilter kept (docs/image.md, sections 1 and 2) and writes their splats
 // (ProjectIds, ProjectOutputs without colours) and the totals. A block takes Gaussians turn by turn, one per
-// thread, and writes their splats after those of all turns before.
-//
-// Every block takes about the same time to decide which pairs are splats. Some blocks take much longer than
-// others to count the tiles of their splats. A block therefore first publishes the number of its splats, then
-// counts the tiles, and only then reads the number of splats of the turns before, so that no block waits for
-// the tile counts of another one.
+// thread, and writes their splats after those of all turns before. To count the tiles of their splats takes
+// some blocks much longer than others, so a block first publishes the number of its splats, then counts the
+// tiles, and only then reads the number of splats of the turns before.
 __global__ void __launch_bounds__(kSplatThreads, kBlocksPerMultiprocessor)
     splats_kernel(const __grid_constant__ Inputs in, const __grid_constant__ RankTiles rank_tiles,
                   const Prefiltered kept, const ProjectSizes capacity, const ProjectIds ids,
@@ -166,20 +153,20 @@ __global__ void __launch_bounds__(kSplatThreads, kBlocksPerMultiprocessor)
   __shared__ Group group;
   __shared__ Pending pending;
   const int thread = threadIdx.x, warp = thread / 32, lane = thread % 32;
-  const std::int64_t n_gaussians = *kept.count;
+  const int64_t n_gaussians = *kept.count;
   const int at_once = projected_at_once(in.n_views);
-  const int n_turns = static_cast<int>((n_gaussians + at_once - 1) / at_once);
+  const int n_turns = int((n_gaussians + at_once - 1) / at_once);
   if (blockIdx.x == 0 && thread == 0) {
     if (n_turns == 0) end_splats(0, capacity, ids);
     if (totals && in.n_blocks) totals[kTotalBlocks] = *in.n_blocks;
   }
-  if (static_cast<int>(blockIdx.x) > n_turns) return;
+  if (int(blockIdx.x) > n_turns) return;
   const bool writes = capacity.splats > 0;
-  for (int i = thread; i < static_cast<int>(sizeof(Sums) / 4); i += kSplatThreads) {
+  for (int i = thread; i < int(sizeof(Sums) / 4); i += kSplatThreads) {
     reinterpret_cast<unsigned*>(&sums)[i] = 0;
   }
   load_cameras(in, cameras);
-  std::int64_t tiles = 0;
+  int64_t tiles = 0;
   unsigned splats_of_view = 0;  // splats of this warp in view number `lane`
   int turn = turns.first();
   if (turn < 0) {
@@ -187,9 +174,9 @@ __global__ void __launch_bounds__(kSplatThreads, kBlocksPerMultiprocessor)
     return;
   }
   for (; turn < n_turns; turn = group.next_turn) {
-    const std::int64_t first = turn * std::int64_t{at_once};
-    std::uint32_t maybe = 0;
-    std::int32_t id = -1;
+    const int64_t first = turn * int64_t{at_once};
+    uint32_t maybe = 0;
+    int32_t id = -1;
     if (thread < at_once && first + thread < n_gaussians) {
       maybe = kept.views[first + thread];
       id = kept.ids[first + thread];
@@ -197,7 +184,7 @@ __global__ void __launch_bounds__(kSplatThreads, kBlocksPerMultiprocessor)
     int n_pairs, p = sum_of_threads_before(__popc(maybe), group, &n_pairs);
     const Vec3<float> mean = triples[warp].gather(in.means, id, lane),
                       scale = triples[warp].gather(in.scales, id, lane);
-    std::uint32_t seen = 0;
+    uint32_t seen = 0;
     if (maybe) {
       const ActivatedGaussian<float> gaussian = make_gaussian(in, id, mean, scale);
       for (; maybe; maybe &= maybe - 1, ++p) {
@@ -206,7 +193,7 @@ __global__ void __launch_bounds__(kSplatThreads, kBlocksPerMultiprocessor)
         pending.pairs[p] = kNoSplat;
         if (!project_splat(cameras[view], gaussian, in.options, &splat)) continue;
         seen |= 1u << view;
-        pending.pairs[p] = static_cast<std::uint16_t>(kMaxViews * thread + view);
+        pending.pairs[p] = uint16_t(kMaxViews * thread + view);
         pending.means2d[p] = {splat.mean2d[0], splat.mean2d[1]};
         for (int k = 0; k < 3; ++k) pending.conics[k][p] = splat.conic[k];
         pending.depths[p] = splat.depth;
@@ -223,7 +210,7 @@ __global__ void __launch_bounds__(kSplatThreads, kBlocksPerMultiprocessor)
     __syncthreads();
     int group_sums;
     group.before[thread] = sum_of_threads_before((seen != 0) << 16 | __popc(seen), group, &group_sums);
-    const std::int64_t turn_sums = std::int64_t{group_sums >> 16} << 31 | (group_sums & 0xffff);
+    const int64_t turn_sums = int64_t{group_sums >> 16} << 31 | (group_sums & 0xffff);
     if (thread == 0) {
       if (writes) turns.publish(turn, turn_sums);
       sums.visible += group_sums >> 16;
@@ -249,7 +236,7 @@ __global__ void __launch_bounds__(kSplatThreads, kBlocksPerMultiprocessor)
     }
     __syncthreads();
     if (writes) {
-      const std::int64_t before = group.before_turn;
+      const int64_t before = group.before_turn;
       write_splats(group, before, pending, n_pairs, capacity, ids, out);
       if (turn == n_turns - 1 && thread == 0) end_splats(before + turn_sums, capacity, ids);
     }
@@ -267,11 +254,11 @@ __global__ void __launch_bounds__(kSplatThreads, kBlocksPerMultiprocessor)
 }  // namespace
 
 void write_splats(const Inputs& in, const RankTiles& rank_tiles, const Prefiltered& kept,
-                  const ProjectSizes& capacity, const ProjectColumns<float>& columns, std::int64_t* totals,
+                  const ProjectSizes& capacity, const ProjectColumns<float>& columns, int64_t* totals,
                   Workspace& workspace, CudaStream stream) {
   const ProjectIds& ids = columns.ids;
   if (totals) {
-    const std::size_t bytes = project_totals(in.n_views, rank_tiles.n_ranks) * sizeof(std::int64_t);
+    const size_t bytes = project_totals(in.n_views, rank_tiles.n_ranks) * sizeof(int64_t);
     check(cudaMemsetAsync(totals, 0, bytes, stream), "project");
   }
   if (capacity.splats == 0 && ids.splat_offsets) {
@@ -279,7 +266,7 @@ void write_splats(const Inputs& in, const RankTiles& rank_tiles, const Prefilter
     if (!totals) return;
   }
   const int at_once = projected_at_once(in.n_views);
-  const std::int64_t turns = std::max<std::int64_t>(1, (in.n_candidates + at_once - 1) / at_once);
+  const int64_t turns = std::max<int64_t>(1, (in.n_candidates + at_once - 1) / at_once);
   splats_kernel<<<resident_blocks(1 + turns, 1, kBlocksPerMultiprocessor), kSplatThreads, 0, stream>>>(
       in, rank_tiles, kept, capacity, ids, columns.values, reinterpret_cast<unsigned long long*>(totals),
       TurnSums(turn_zeros(turns, workspace, stream)));

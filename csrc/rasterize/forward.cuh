@@ -2,16 +2,13 @@
 // Code that two CUDA passes share: the forward pass of the rasteriser (rasterize_fwd_cuda.cu) and the
 // contributions of splats (importance_cuda.cu). It packs the splats, orders the tiles and composites a pixel.
 #pragma once
-#include <cstdint>
-
-#include "common/cuda.cuh"
 #include "rasterize/tile_batch.cuh"
 
 namespace blitzgs::cuda {
 
 inline constexpr int kPackThreads = 256;
 
-__device__ __forceinline__ PackedSplat pack_splat(const RasterizeInput<float>& in, std::int64_t i) {
+__device__ __forceinline__ PackedSplat pack_splat(const RasterizeInput<float>& in, int64_t i) {
   const float conic[3] = {in.conics[3 * i], in.conics[3 * i + 1], in.conics[3 * i + 2]};
   const ConicFactor<float> factor = factor_conic(conic);
   PackedSplat splat;
@@ -22,7 +19,7 @@ __device__ __forceinline__ PackedSplat pack_splat(const RasterizeInput<float>& i
   splat.l22 = kFactorScale * factor.l22;
   splat.log2_opacity = log2f(in.opacities[i]);
   splat.dx_per_dy = -conic[1] / conic[0];
-  const float width = sqrtf(conic[2] / static_cast<float>(conic_determinant(conic)));
+  const float width = sqrtf(conic[2] / float(conic_determinant(conic)));
   splat.turn = conic[1] == 0.f ? 0.f : -(conic[1] / conic[2]) * (width / kFactorScale);
   return splat;
 }
@@ -33,21 +30,21 @@ __device__ __forceinline__ PackedSplat pack_splat(const RasterizeInput<float>& i
 inline __global__ void __launch_bounds__(kPackThreads, 8)
     prepare_kernel(RasterizeInput<float> in, PackedSplat* splats, float4* colors, TileOrder order) {
   wait_for_earlier_kernels();
-  const auto pack_blocks = static_cast<unsigned>((in.n_splats + kPackThreads - 1) / kPackThreads);
+  const auto pack_blocks = unsigned((in.n_splats + kPackThreads - 1) / kPackThreads);
   if (blockIdx.x >= pack_blocks) {
-    order.add(in.tile_offsets, static_cast<int>((blockIdx.x - pack_blocks) * kPackThreads + threadIdx.x));
+    order.add(in.tile_offsets, int((blockIdx.x - pack_blocks) * kPackThreads + threadIdx.x));
     return;
   }
-  const std::int64_t n = valid_splat_count(in);
+  const int64_t n = valid_splat_count(in);
   __shared__ PackedSplat stages[kPackThreads];
   const PackedSplat* stage = stages + threadIdx.x / 32 * 32;
   const int lane = threadIdx.x % 32;
-  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kPackThreads) + threadIdx.x;
+  const int64_t i = blockIdx.x * int64_t(kPackThreads) + threadIdx.x;
   if (i < n) stages[threadIdx.x] = pack_splat(in, i);
   __syncwarp();
 #pragma unroll
   for (int k = 0; k < 2; ++k) {
-    const std::int64_t at = 2 * (i - lane) + 32 * k + lane;
+    const int64_t at = 2 * (i - lane) + 32 * k + lane;
     if (at < 2 * n) {
       reinterpret_cast<float4*>(splats)[at] = reinterpret_cast<const float4*>(stage)[32 * k + lane];
     }
@@ -61,7 +58,6 @@ inline __global__ void __launch_bounds__(kPackThreads, 8)
   colors[i] = c;
 }
 
-// Launches prepare_kernel. `what` is the name of the op in error messages.
 inline void prepare(const char* what, const RasterizeInput<float>& in, PackedSplat* splats, float4* colors,
                     const TileOrder& order, CudaStream stream) {
   order.clear(stream);
@@ -76,8 +72,7 @@ inline void prepare(const char* what, const RasterizeInput<float>& in, PackedSpl
 // List entries that a block copies at a time.
 inline constexpr int kForwardBatch = 256;
 
-// The alphas of four entries of a batch at a pixel, zero for entries that are not composited, and whether
-// each entry is composited.
+// The alphas of four entries of a batch at a pixel, zero if not composited, and whether they are.
 struct QuadAlphas {
   float at[4];
   bool touched[4];
@@ -86,13 +81,12 @@ struct QuadAlphas {
 // The state of one pixel while its list is composited. For each four entries, alphas() comes first, and then
 // composite() of each alpha in order. `ended` is a byte offset of an entry in the current batch. The
 // transmittance and the weights are in units of 1 / kScale. It is a power of two, so it changes no rounding.
-template <std::int64_t kScale = 1>
-struct Compositor {
-  static constexpr std::uint32_t kNone = ~0u;
-  static constexpr float kEnd = static_cast<float>(kMinTransmittance) * static_cast<float>(kScale);
-  float transmittance = static_cast<float>(kScale);
-  float limit;                  // the least log2(alpha) that is composited; infinite once the pixel has ended
-  std::uint32_t ended = kNone;  // the entry at which the pixel ended
+template <int64_t kScale = 1> struct Compositor {
+  static constexpr uint32_t kNone = ~0u;
+  static constexpr float kEnd = float(kMinTransmittance) * float(kScale);
+  float transmittance = float(kScale);
+  float limit;             // the least log2(alpha) that is composited; infinite once the pixel has ended
+  uint32_t ended = kNone;  // the entry at which the pixel ended
 
   // Finds the alphas of four entries of a batch. It tests once for all four whether a pixel of the warp ends.
   __device__ __forceinline__ QuadAlphas alphas(const char* entries, const QuadOffsets& offsets,
@@ -103,7 +97,7 @@ struct Compositor {
     for (int k = 0; k < 4; ++k) {
       const float log2_a = log2_alpha(entry_at(entries, offsets.at[k]), pixel);
       alpha.touched[k] = log2_a >= limit;
-      alpha.at[k] = alpha.touched[k] ? fminf(exp2_approx(log2_a), static_cast<float>(kAlphaMax)) : 0.f;
+      alpha.at[k] = alpha.touched[k] ? fminf(exp2_approx(log2_a), float(kAlphaMax)) : 0.f;
       after = __fmaf_rn(-alpha.at[k], after, after);
     }
     if (__any_sync(kFullWarp, after < kEnd)) end(alpha, offsets);

@@ -6,10 +6,7 @@
 // g dx^2 and so on are moments of g over the pixel grid.
 #pragma once
 #include <cub/device/device_radix_sort.cuh>
-#include <stdexcept>
-#include <string>
 
-#include "common/cuda.cuh"
 #include "rasterize/tile_batch.cuh"
 
 namespace blitzgs::cuda {
@@ -33,15 +30,13 @@ __device__ __forceinline__ void add_quad(float* address, float a, float b, float
 }
 
 // The gradients of the loss by the colours of a subtile's pixels, channel by channel.
-template <int CHANNELS>
-struct __align__(16) SubtileGradient {
+template <int CHANNELS> struct __align__(16) SubtileGradient {
   float v[CHANNELS][kSubtile * kSubtile];
 };
 
 // The sums of one entry over the pixels of a subtile: weights times v_render (the colour's gradient), the
 // moments of g about the subtile's centre, and the absolute values of the mean's gradient (absgrad).
-template <int CHANNELS>
-struct EntrySums {
+template <int CHANNELS> struct EntrySums {
   float color[CHANNELS] = {};
   float g = 0.f, gx = 0.f, gy = 0.f, gxx = 0.f, gxy = 0.f, gyy = 0.f;
   float abs_x = 0.f, abs_y = 0.f;
@@ -83,7 +78,7 @@ __device__ __forceinline__ EntrySums<CHANNELS> sum_pixels(const float2* group,
       const float g[kSubtile] = {left.y, left.w, right.y, right.w};
 #pragma unroll
       for (int column = 0; column < kSubtile; ++column) {
-        const float dx = x + (static_cast<float>(column) - 1.5f), dy = y + (static_cast<float>(row) - 1.5f);
+        const float dx = x + (float(column) - 1.5f), dy = y + (float(row) - 1.5f);
         const float u = shape.l11 * dx + shape.l21 * dy, w = shape.l22 * dy;
         sums.abs_x += fabsf(g[column] * (shape.l11 * u));
         sums.abs_y += fabsf(g[column] * (shape.l21 * u + shape.l22 * w));
@@ -120,8 +115,7 @@ __device__ __forceinline__ PackedGradient finish(const EntrySums<CHANNELS>& s, c
 }
 
 // The state of one pixel while the backward pass visits its list from the last entry to the first.
-template <int CHANNELS>
-struct BackwardPixel {
+template <int CHANNELS> struct BackwardPixel {
   float transmittance;  // in front of the entries visited so far
   float behind;         // v . (the colour of those entries and the background, as seen with T = 1)
   float v[CHANNELS];    // the gradient of the loss by the pixel's colour
@@ -129,7 +123,7 @@ struct BackwardPixel {
   // Visits four entries of a batch and writes the weight and g of each to slots[k * kGroupStride]. last: the
   // forward pass composited no entry of this offset or a higher one. dot(offset): v . colour of the entry.
   template <class Dot>
-  __device__ __forceinline__ void add(const char* entries, const QuadOffsets& offsets, std::uint32_t last,
+  __device__ __forceinline__ void add(const char* entries, const QuadOffsets& offsets, uint32_t last,
                                       const Pixel& pixel, const Dot& dot, float2* slots) {
     float raw[4], dots[4];
     bool touched[4];
@@ -142,12 +136,12 @@ struct BackwardPixel {
     }
 #pragma unroll
     for (int k = 0; k < 4; ++k) {
-      const float alpha = touched[k] ? fminf(raw[k], static_cast<float>(kAlphaMax)) : 0.f;
+      const float alpha = touched[k] ? fminf(raw[k], float(kAlphaMax)) : 0.f;
       transmittance *= reciprocal_approx(1.f - alpha);
       const float weight = alpha * transmittance;
       const float difference = dots[k] - behind;
       if (touched[k]) behind = __fmaf_rn(alpha, difference, behind);  // the test avoids 0 * NaN
-      const bool differentiable = touched[k] && raw[k] <= static_cast<float>(kAlphaMax);
+      const bool differentiable = touched[k] && raw[k] <= float(kAlphaMax);
       slots[k * kGroupStride] = {weight, differentiable ? weight * difference : 0.f};
     }
   }
@@ -156,10 +150,9 @@ struct BackwardPixel {
 // Deterministic gradients: a stable sort groups the list entries by splat, and sum_entries_kernel adds the
 // gradients of a splat's entries in the order of the list.
 
-// values[i] = i, one thread per value.
-inline __global__ void iota_kernel(std::int32_t* values, std::int64_t n) {
-  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x;
-  if (i < n) values[i] = static_cast<std::int32_t>(i);
+inline __global__ void iota_kernel(int32_t* values, int64_t n) {
+  const int64_t i = blockIdx.x * int64_t(blockDim.x) + threadIdx.x;
+  if (i < n) values[i] = int32_t(i);
 }
 
 // splat_gradients[splat] = the sum of entry_gradients over the splat's entries, in the order of the list of
@@ -167,16 +160,15 @@ inline __global__ void iota_kernel(std::int32_t* values, std::int64_t n) {
 // splat's first entry sum over all its entries. Entries from *n_listed on belong to no tile, and their splats
 // are unspecified. The stable sort puts them after the listed entries of the same splat, so the sum ends at
 // the first of them.
-inline __global__ void sum_entries_kernel(const std::int32_t* sorted_splats, const std::int32_t* entries,
-                                          std::int64_t n, const std::int64_t* n_listed,
-                                          const PackedGradient* entry_gradients,
+inline __global__ void sum_entries_kernel(const int32_t* sorted_splats, const int32_t* entries, int64_t n,
+                                          const int64_t* n_listed, const PackedGradient* entry_gradients,
                                           PackedGradient* splat_gradients) {
-  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x;
+  const int64_t i = blockIdx.x * int64_t(blockDim.x) + threadIdx.x;
   if (i >= 3 * n) return;
-  const int quad = static_cast<int>(i % 3);
-  std::int64_t at = i / 3;
-  const std::int64_t end = *n_listed;
-  const std::int32_t splat = sorted_splats[at];
+  const int quad = int(i % 3);
+  int64_t at = i / 3;
+  const int64_t end = *n_listed;
+  const int32_t splat = sorted_splats[at];
   if (entries[at] >= end || (at > 0 && sorted_splats[at - 1] == splat)) return;
   float4 sum{0.f, 0.f, 0.f, 0.f};
   for (; at < n && sorted_splats[at] == splat && entries[at] < end; ++at) {
@@ -188,11 +180,10 @@ inline __global__ void sum_entries_kernel(const std::int32_t* sorted_splats, con
 
 // The list entries sorted by splat: the splat and the position in the list of each, [n].
 struct EntriesBySplat {
-  std::int32_t* splats;
-  std::int32_t* entries;
+  int32_t *splats, *entries;
 };
 
-inline EntriesBySplat sort_entries(const std::int32_t* isect_splats, std::int64_t n, std::int64_t n_splats,
+inline EntriesBySplat sort_entries(const int32_t* isect_splats, int64_t n, int64_t n_splats,
                                    Workspace& workspace, CudaStream stream) {
   if (n > INT32_MAX) {
     throw std::runtime_error(
@@ -200,12 +191,12 @@ inline EntriesBySplat sort_entries(const std::int32_t* isect_splats, std::int64_
         std::to_string(n) + "; render fewer views at once or set deterministic=False");
   }
   int bits = 1;
-  while (bits < 31 && (std::int64_t{1} << bits) < n_splats) ++bits;
-  EntriesBySplat sorted{workspace.allocate<std::int32_t>(n), workspace.allocate<std::int32_t>(n)};
-  auto* order = workspace.allocate<std::int32_t>(n);
+  while (bits < 31 && (int64_t{1} << bits) < n_splats) ++bits;
+  EntriesBySplat sorted{workspace.allocate<int32_t>(n), workspace.allocate<int32_t>(n)};
+  auto* order = workspace.allocate<int32_t>(n);
   iota_kernel<<<blocks_for(n, 256), 256, 0, stream>>>(order, n);
   check_launch("rasterize_bwd");
-  run_cub("rasterize_bwd", workspace, [&](void* scratch, std::size_t& bytes) {
+  run_cub("rasterize_bwd", workspace, [&](void* scratch, size_t& bytes) {
     return cub::DeviceRadixSort::SortPairs(scratch, bytes, isect_splats, sorted.splats, order, sorted.entries,
                                            n, 0, bits, stream);
   });
@@ -234,15 +225,15 @@ __device__ __forceinline__ void store_splats(float* stage, const float (&mine)[W
 // Writes the packed gradients [n] to one array per input: v_colors, v_means2d, v_conics, v_opacities and, if
 // wanted, v_means2d_abs. One thread per splat. The first chunk of channels writes, later chunks add.
 // colors_only: the first chunk gave the complete gradients of everything but the colours.
-inline __global__ void unpack_kernel(const PackedGradient* packed, std::int64_t n, ChannelChunk chunk,
+inline __global__ void unpack_kernel(const PackedGradient* packed, int64_t n, ChannelChunk chunk,
                                      bool colors_only, RasterizeGradients<float> out) {
   __shared__ float4 stages[kUnpackThreads / 32][3 * 32];
   wait_for_earlier_kernels();
   float4* stage = stages[threadIdx.x / 32];
   const int lane = threadIdx.x % 32;
-  const std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kUnpackThreads) + threadIdx.x;
-  const std::int64_t first = i - lane;  // the first splat of the warp
-  const int n_splats = static_cast<int>(min(max(n - first, std::int64_t{0}), std::int64_t{32}));
+  const int64_t i = blockIdx.x * int64_t(kUnpackThreads) + threadIdx.x;
+  const int64_t first = i - lane;  // the first splat of the warp
+  const int n_splats = int(min(max(n - first, int64_t{0}), int64_t{32}));
 #pragma unroll
   for (int k = 0; k < 3; ++k) {
     const int at = 32 * k + lane;

@@ -3,8 +3,7 @@
 // 3 and 5; Kerbl et al. 2023, Eq. 3), and its gradient. Culling inside the kernels is conservative. They
 // evaluate
 //   q = a dx^2 + 2 b dx dy + c dy^2,  (dx, dy) = pixel centre - mean2d,  conic = (a, b, c)
-// through factor_conic() of math/tiles.h, because the slack of the tile test covers the rounding of that
-// form.
+// through factor_conic() of math/tiles.h, whose rounding the slack of the tile test covers.
 //
 //   means2d [P, 2], conics [P, 3], opacities [P], colors [P, D], backgrounds [B, D] or null, isect_splats and
 //   tile_offsets from intersect  ->  renders [B, H, W, D]; transmittances [B, H, W] (final T; alpha = 1 - T);
@@ -30,61 +29,44 @@
 //   v_conics      = -sum of g (dx^2 / 2, dx dy, dy^2 / 2)
 // g is 0 where min(0.99, .) clips; the order, the cut at 1/255 and the end of a pixel count as constants. The
 // caller computes the gradient of the background, the sum over pixels of v_renders * T. Splats in no list get
-// zeros. v_renders of unowned tiles are not read.
-//
-// With known_splats (common/kernel.h), gradients beyond that number are unspecified, and the backward pass
-// may be called with just these splats.
+// zeros. v_renders of unowned tiles are not read. With known_splats (common/kernel.h), gradients beyond that
+// number are unspecified, and the backward pass may be called with just these splats.
 //
 // The CPU gradient is bitwise repeatable for any number of threads: there is one partial sum per splat and
 // tile, and these are added in the order of the tiles. The CUDA gradient is repeatable if `deterministic` is
 // set. The cost is O(entries processed x pixels of the splat).
 #pragma once
-#include <cstdint>
-
-#include "common/kernel.h"
 #include "math/tiles.h"
 
 namespace blitzgs {
 
-template <class T>
-struct RasterizeInput {
-  const T* means2d;
-  const T* conics;
-  const T* opacities;
-  const T* colors;
+template <class T> struct RasterizeInput {
+  const T *means2d, *conics, *opacities, *colors;
   const T* backgrounds;  // null: black
-  const std::int32_t* isect_splats;
-  const std::int64_t* tile_offsets;
-  std::int64_t n_splats;
+  const int32_t* isect_splats;
+  const int64_t* tile_offsets;
+  int64_t n_splats;
   int n_channels;
   TileGrid grid;
-  const std::int64_t* known_splats = nullptr;  // null: n_splats
+  const int64_t* known_splats = nullptr;  // null: n_splats
 };
 
-template <class T>
-struct RasterizeOutput {
-  T* renders;
-  T* transmittances;
-  std::int32_t* last_ids;
-  std::int32_t* tile_work;
+template <class T> struct RasterizeOutput {
+  T *renders, *transmittances;
+  int32_t *last_ids, *tile_work;
   T* splat_gradients;  // null, or [P] SplatGradient that forward sets to zero (CUDA, up to four channels)
   bool clear_rest;
 };
 
-template <class T>
-struct RasterizeSaved {
+template <class T> struct RasterizeSaved {
   const T* transmittances;
-  const std::int32_t* last_ids;
+  const int32_t* last_ids;
   const T* v_renders;
   const T* v_alphas;  // null: zero
 };
 
-template <class T>
-struct RasterizeGradients {
-  T* v_means2d;
-  T* v_conics;
-  T* v_opacities;
-  T* v_colors;
+template <class T> struct RasterizeGradients {
+  T *v_means2d, *v_conics, *v_opacities, *v_colors;
   T* v_means2d_abs;  // null: not wanted
 };
 
@@ -94,31 +76,11 @@ inline constexpr int kTileOrderClasses = 16;
 // Memory that forward fills for backward besides its outputs, in the layout of the backend. Backward may be
 // called with fewer splats than forward had capacity for, and for fewer tiles than forward composited.
 struct RasterizeAux {
-  void* packed;         // the packed splats, splats * rasterize_splat_bytes() bytes, 64-byte aligned
-  std::int64_t splats;  // the capacity of forward
-  std::int32_t* order;  // [1 + composited, kTileOrderClasses] of tile_order.cuh; null: tiles by their numbers
-  std::int64_t composited;  // the number of composited tiles
+  void* packed;        // the packed splats, splats * rasterize_splat_bytes() bytes, 64-byte aligned
+  int64_t splats;      // the capacity of forward
+  int32_t* order;      // [1 + composited, kTileOrderClasses] of tile_order.cuh; null: tiles by their numbers
+  int64_t composited;  // the number of composited tiles
 };
-
-namespace BLITZGS_BACKEND {
-std::int64_t rasterize_splat_bytes(int n_channels);
-// Whether forward leaves an order of the tiles that it composites.
-bool rasterize_orders_tiles(const TileGrid& grid);
-template <class T>
-void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, const RasterizeAux& aux,
-                   Workspace&, CudaStream);
-template <class T>
-void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, std::int64_t n_isects,
-                   const RasterizeAux& aux, bool deterministic, const RasterizeGradients<T>& gradients,
-                   Workspace&, CudaStream);
-}  // namespace BLITZGS_BACKEND
-
-namespace cuda {
-// rasterize_bwd that adds the gradients to the table `packed` [P] of SplatGradient.
-void rasterize_bwd_packed(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
-                          std::int64_t n_isects, const RasterizeAux& aux, bool deterministic, bool absolute,
-                          float* packed, Workspace&, CudaStream);
-}  // namespace cuda
 
 // Which splats each pixel composites. Compositing is as above, without colours, so alpha and T of
 // a pixel have the bits with which the backend renders it (with the same tile size). Per pixel, over the
@@ -136,19 +98,31 @@ void rasterize_bwd_packed(const RasterizeInput<float>& in, const RasterizeSaved<
 //   [R, strongest]. Row slots[b, y, x] of the results is that of a pixel; a slot outside [0, R) is no row.
 //   Rows without a pixel are not written. Without slots, the rows are the pixels, R = B H W.
 //
-// The cost is that of compositing without colours, and O(strongest) for each splat that is among the
-// strongest so far.
-template <class T>
-struct PixelSplats {
-  const std::int32_t* slots;  // null: a row for each pixel
-  std::int64_t rows;
+// The cost is that of compositing without colours, and O(strongest) for each of the strongest so far.
+template <class T> struct PixelSplats {
+  const int32_t* slots;  // null: a row for each pixel
+  int64_t rows;
   int strongest;
   T* transmittances;
-  std::int32_t *counts, *medians, *ids;
+  int32_t *counts, *medians, *ids;
   T* weights;
 };
 
 namespace BLITZGS_BACKEND {
+int64_t rasterize_splat_bytes(int n_channels);
+// Whether forward leaves an order of the tiles that it composites.
+bool rasterize_orders_tiles(const TileGrid& grid);
+template <class T>
+void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, const RasterizeAux& aux,
+                   Workspace&, CudaStream);
+template <class T>
+void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, int64_t n_isects,
+                   const RasterizeAux& aux, bool deterministic, const RasterizeGradients<T>& gradients,
+                   Workspace&, CudaStream);
+// (CUDA) rasterize_bwd that adds the gradients to the table `packed` [P] of SplatGradient.
+void rasterize_bwd_packed(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
+                          int64_t n_isects, const RasterizeAux& aux, bool deterministic, bool absolute,
+                          float* packed, Workspace&, CudaStream);
 template <class T>
 void pixel_splats(const RasterizeInput<T>& in, const PixelSplats<T>& out, Workspace&, CudaStream);
 }  // namespace BLITZGS_BACKEND
@@ -159,18 +133,16 @@ namespace {
 constexpr float kMedianTransmittance = 0.5f;
 
 // The row of a pixel; negative: none.
-template <class T>
-BLITZGS_HD std::int64_t row_of(const PixelSplats<T>& out, std::int64_t pixel) {
+template <class T> BLITZGS_HD int64_t row_of(const PixelSplats<T>& out, int64_t pixel) {
   if (!out.slots) return pixel;
-  const std::int64_t slot = out.slots[pixel];
+  const int64_t slot = out.slots[pixel];
   return slot < out.rows ? slot : -1;
 }
 
 // Adds a splat behind the first `count` of a pixel to its `most` > 0 strongest. Returns the weight that the
 // next splat must exceed to be one of them.
 template <class T>
-BLITZGS_HD T keep_strongest(std::int32_t* ids, T* weights, int most, std::int32_t count, std::int32_t id,
-                            T weight) {
+BLITZGS_HD T keep_strongest(int32_t* ids, T* weights, int most, int32_t count, int32_t id, T weight) {
   int end = count < most ? count : most;
   if (end == most) {
     int weakest = 0;
@@ -190,5 +162,4 @@ BLITZGS_HD T keep_strongest(std::int32_t* ids, T* weights, int most, std::int32_
 }
 
 }  // namespace
-
 }  // namespace blitzgs

@@ -5,11 +5,9 @@
 // from the forward pass. The half-warp writes w and g (rasterize.h) of sixteen entries to shared memory. Each
 // lane then sums over the sixteen pixels for one of the entries (gradients.cuh).
 
-#include "common/cuda.cuh"
 #include "rasterize/gradients.cuh"
 
 namespace blitzgs::cuda {
-
 namespace {
 
 struct BackwardArguments : ChunkInput {
@@ -18,15 +16,14 @@ struct BackwardArguments : ChunkInput {
   PackedGradient* entry_gradients;  // [I], written once each (deterministic)
 };
 
-template <int CHANNELS, bool DETERMINISTIC>
-struct BackwardShared {
+template <int CHANNELS, bool DETERMINISTIC> struct BackwardShared {
   static constexpr int kBatch = DETERMINISTIC ? 64 : 256;
   static constexpr int kWarps = Tile::kWarps, kSubtiles = Tile::kSubtiles;
   EntryBatch<kBatch> batch;
   SubtileGradient<CHANNELS> v_render[kSubtiles];
   float2 group[kSubtiles][kGroup * kGroupStride];  // weight, g
   PackedGradient partial[DETERMINISTIC ? kWarps : 1][DETERMINISTIC ? kBatch : 1];
-  std::int32_t splat[2][kBatch + 1];  // -1 where there is no entry
+  int32_t splat[2][kBatch + 1];  // -1 where there is no entry
   int last;
 };
 
@@ -36,21 +33,20 @@ __device__ __forceinline__ float4 add_halves(float4 a) {
 }
 
 // Sums a group of entries, list[0 .. filled) of the half-warp's list, over the subtile's pixels, one lane per
-// entry. Adds the sums to the splats' gradients atomically or, if DETERMINISTIC, stores them in
-// shared.partial.
+// entry. Adds them to the splats' gradients atomically or (DETERMINISTIC) stores them in shared.partial.
 template <int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC>
 __device__ __forceinline__ void flush_group(BackwardShared<CHANNELS, DETERMINISTIC>& shared,
                                             const BackwardArguments& args, const TilePlace& tile,
                                             const Pixel& pixel, int buffer, int filled,
-                                            const std::uint16_t* list) {
+                                            const uint16_t* list) {
   __syncwarp();
   const int slot = threadIdx.x % kGroup;
-  const std::uint32_t offset = slot < filled ? list[slot] : shared.batch.kNothing;
+  const uint32_t offset = slot < filled ? list[slot] : shared.batch.kNothing;
   const Entry& shape = entry_at(reinterpret_cast<const char*>(shared.batch.entries[buffer]), offset);
-  const int my_entry = static_cast<int>(offset / sizeof(Entry));
+  const int my_entry = int(offset / sizeof(Entry));
   constexpr int kColumns = Tile::kColumns, kMiddle = kSubtile / 2;
-  const float x = static_cast<float>(tile.left + pixel.subtile % kColumns * kSubtile + kMiddle) - shape.x;
-  const float y = static_cast<float>(tile.top + pixel.subtile / kColumns * kSubtile + kMiddle) - shape.y;
+  const float x = float(tile.left + pixel.subtile % kColumns * kSubtile + kMiddle) - shape.x;
+  const float y = float(tile.top + pixel.subtile / kColumns * kSubtile + kMiddle) - shape.y;
   const EntrySums<CHANNELS> sums = sum_pixels<CHANNELS, ABSOLUTE>(
       shared.group[pixel.subtile] + slot * kGroupStride, shared.v_render[pixel.subtile], shape, x, y);
   PackedGradient gradient = finish<CHANNELS, ABSOLUTE>(sums, shape, x, y);
@@ -85,8 +81,7 @@ __device__ __forceinline__ void flush_group(BackwardShared<CHANNELS, DETERMINIST
 }
 
 // Returns the state of a pixel behind its last entry, and writes the pixel's gradient to shared.v_render.
-// That of a pixel without splats (last is 0) counts as zero, also if it is NaN, as that of 1 / depth is
-// there.
+// That of a pixel without splats (last is 0) counts as zero, also if it is NaN, as of 1 / depth.
 template <int CHANNELS, bool WIDE, class Shared>
 __device__ __forceinline__ BackwardPixel<CHANNELS> start_pixel(Shared& shared, const BackwardArguments& args,
                                                                const Pixel& pixel, int last, int camera) {
@@ -104,7 +99,7 @@ __device__ __forceinline__ BackwardPixel<CHANNELS> start_pixel(Shared& shared, c
     shared.v_render[pixel.subtile].v[k][threadIdx.x % kHalfWarp] = state.v[k];
   }
   if (pixel.inside && args.backgrounds) {
-    const float* background = args.backgrounds + static_cast<std::int64_t>(camera) * chunk.n_channels;
+    const float* background = args.backgrounds + int64_t(camera) * chunk.n_channels;
     const int first = WIDE ? 0 : chunk.first, end = WIDE ? chunk.n_channels : chunk.first + chunk.count;
     for (int k = first; k < end; ++k) open += v_render[k] * background[k];
   }
@@ -113,11 +108,10 @@ __device__ __forceinline__ BackwardPixel<CHANNELS> start_pixel(Shared& shared, c
 }
 
 // v_render . color over all channels.
-__device__ __noinline__ float wide_dot(const BackwardArguments& args, const Pixel& pixel,
-                                       std::int32_t splat) {
+__device__ __noinline__ float wide_dot(const BackwardArguments& args, const Pixel& pixel, int32_t splat) {
   const int n = args.chunk.n_channels;
   const float* v = args.saved.v_renders + pixel.index * n;
-  const float* color = args.chunk.colors + static_cast<std::int64_t>(splat) * n;
+  const float* color = args.chunk.colors + int64_t(splat) * n;
   float sum = 0.f;
   for (int k = 0; k < n; ++k) sum = __fmaf_rn(v[k], color[k], sum);
   return sum;
@@ -136,10 +130,10 @@ __global__ void __launch_bounds__(Tile::kThreads, 768 / Tile::kThreads)
   Shared& shared = *reinterpret_cast<Shared*>(shared_bytes);
   wait_for_earlier_kernels();
   const int thread = threadIdx.x, lane = thread % kHalfWarp;
-  const std::int64_t index = args.order.tile(static_cast<int>(blockIdx.x));
+  const int64_t index = args.order.tile(int(blockIdx.x));
   if (index < args.grid.tile_begin || index >= args.grid.tile_end) return;  // forward alone composited it
   const TilePlace tile = locate_tile(args.grid, index);
-  const std::int64_t start = args.tile_offsets[tile.tile];
+  const int64_t start = args.tile_offsets[tile.tile];
   if (args.tile_offsets[tile.tile + 1] == start) return;
   const Pixel pixel = locate_pixel(args.grid, tile, thread);
 
@@ -160,7 +154,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 768 / Tile::kThreads)
     return thread < kBatch && at >= 0 && at < count ? args.isect_splats[start + at] : -1;
   };
   int base = (count - 1) / kBatch * kBatch, buffer = 0;
-  std::int32_t splat = splat_at(base + thread), next_splat = splat_at(base - kBatch + thread);
+  int32_t splat = splat_at(base + thread), next_splat = splat_at(base - kBatch + thread);
   shared.batch.fetch(0, args.splats, args.chunk, splat, thread);
   for (; base >= 0 && count > 0; base -= kBatch, buffer ^= 1) {
     if (thread < kBatch) {
@@ -177,7 +171,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 768 / Tile::kThreads)
     next_splat = splat_at(base - 2 * kBatch + thread);
 
     const char* entries = reinterpret_cast<const char*>(shared.batch.entries[buffer]);
-    const auto dot = [&](std::uint32_t offset) {
+    const auto dot = [&](uint32_t offset) {
       if constexpr (WIDE) {
         const int wide_splat = pixel.inside ? shared.splat[buffer][offset / sizeof(Entry)] : -1;
         return wide_splat < 0 ? 0.f : wide_dot(args, pixel, wide_splat);
@@ -189,8 +183,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 768 / Tile::kThreads)
         return sum;
       }
     };
-    const std::uint32_t last =
-        static_cast<std::uint32_t>(min(max(pixel_last - base, 0), kBatch) * static_cast<int>(sizeof(Entry)));
+    const uint32_t last = uint32_t(min(max(pixel_last - base, 0), kBatch) * int(sizeof(Entry)));
     const int quads =
         shared.batch.template list<true, DETERMINISTIC>(buffer, pixel.subtile, lane, list_last - base);
     const uint2* list = shared.batch.quads(pixel.subtile);
@@ -202,7 +195,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 768 / Tile::kThreads)
         state.add(entries, QuadOffsets(list[i]), last, pixel, dot, slots);
       }
       flush_group<CHANNELS, ABSOLUTE, DETERMINISTIC>(shared, args, tile, pixel, buffer, 4 * filled,
-                                                     reinterpret_cast<const std::uint16_t*>(group));
+                                                     reinterpret_cast<const uint16_t*>(group));
     }
     if constexpr (DETERMINISTIC) {
       __syncthreads();
@@ -221,7 +214,7 @@ __global__ void __launch_bounds__(Tile::kThreads, 768 / Tile::kThreads)
 
 template <int CHANNELS, bool ABSOLUTE, bool DETERMINISTIC, bool WIDE>
 void launch_backward(const BackwardArguments& args, CudaStream stream) {
-  const LaunchShape shape{static_cast<unsigned>(args.order.n_tiles), Tile::kThreads, stream,
+  const LaunchShape shape{unsigned(args.order.n_tiles), Tile::kThreads, stream,
                           sizeof(BackwardShared<CHANNELS, DETERMINISTIC>)};
   launch_early("rasterize_bwd", backward_kernel<CHANNELS, ABSOLUTE, DETERMINISTIC, WIDE>, shape, args);
 }
@@ -246,8 +239,8 @@ void dispatch_backward(const BackwardArguments& args, bool absolute, CudaStream 
 // deterministic gradients need and sorts the list by splat.
 class SplatGradientSums {
  public:
-  SplatGradientSums(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
-                    std::int64_t n_isects, bool deterministic, Workspace& workspace, CudaStream stream)
+  SplatGradientSums(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved, int64_t n_isects,
+                    bool deterministic, Workspace& workspace, CudaStream stream)
       : saved_(saved),
         n_isects_(n_isects),
         stream_(stream),
@@ -274,7 +267,7 @@ class SplatGradientSums {
 
  private:
   const RasterizeSaved<float>& saved_;
-  std::int64_t n_isects_;
+  int64_t n_isects_;
   CudaStream stream_;
   bool empty_;
   EntriesBySplat sorted_{};
@@ -285,7 +278,7 @@ class SplatGradientSums {
 
 template <>
 void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
-                          std::int64_t n_isects, const RasterizeAux& aux, bool deterministic,
+                          int64_t n_isects, const RasterizeAux& aux, bool deterministic,
                           const RasterizeGradients<float>& gradients, Workspace& workspace,
                           CudaStream stream) {
   if (in.n_splats == 0) return;
@@ -303,7 +296,7 @@ void rasterize_bwd<float>(const RasterizeInput<float>& in, const RasterizeSaved<
 }
 
 void rasterize_bwd_packed(const RasterizeInput<float>& in, const RasterizeSaved<float>& saved,
-                          std::int64_t n_isects, const RasterizeAux& aux, bool deterministic, bool absolute,
+                          int64_t n_isects, const RasterizeAux& aux, bool deterministic, bool absolute,
                           float* packed, Workspace& workspace, CudaStream stream) {
   if (in.n_splats == 0) return;
   const SplatGradientSums splats(in, saved, n_isects, deterministic, workspace, stream);

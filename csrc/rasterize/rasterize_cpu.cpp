@@ -1,24 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
-#include <vector>
-
-#include "common/parallel.h"
 #include "rasterize/rasterize.h"
 #include "rasterize/tile_jobs.h"
 
 namespace blitzgs::cpu {
-
 namespace {
 
 // The number of partial gradients (one per splat and tile) in memory at a time: a few megabytes, so that they
 // are still in the cache when they are summed.
-constexpr std::int64_t kPartialsPerChunk = 1 << 17;
+constexpr int64_t kPartialsPerChunk = 1 << 17;
 
-template <class T>
-void clear_unowned(const RasterizeInput<T>& in, const RasterizeOutput<T>& out) {
+template <class T> void clear_unowned(const RasterizeInput<T>& in, const RasterizeOutput<T>& out) {
   const TileGrid& grid = in.grid;
   if (grid.tile_begin == 0 && grid.tile_end == grid.count()) return;
-  const std::int64_t pixels = static_cast<std::int64_t>(grid.n_cameras) * grid.height * grid.width;
+  const int64_t pixels = int64_t(grid.n_cameras) * grid.height * grid.width;
   std::fill_n(out.renders, pixels * in.n_channels, T(0));
   std::fill_n(out.transmittances, pixels, T(0));
   std::fill_n(out.last_ids, pixels, 0);
@@ -27,32 +21,30 @@ void clear_unowned(const RasterizeInput<T>& in, const RasterizeOutput<T>& out) {
 
 // Writes to used [owned tiles] the length of each owned tile's list up to its last composited entry.
 template <class T>
-void find_used_entries(const RasterizeInput<T>& in, const std::int32_t* last_ids, std::int32_t* used) {
-  parallel_rows(in.grid.tile_end - in.grid.tile_begin, 8, [&](std::int64_t owned) {
+void find_used_entries(const RasterizeInput<T>& in, const int32_t* last_ids, int32_t* used) {
+  parallel_rows(in.grid.tile_end - in.grid.tile_begin, 8, [&](int64_t owned) {
     const TileJob<T> job = make_job<T>(in, nullptr, in.grid.tile_begin + owned);
-    std::int32_t most = 0;
+    int32_t most = 0;
     for (int row = 0; row < job.height; ++row) {
-      const std::int32_t* last =
-          last_ids + job.first_pixel + static_cast<std::int64_t>(row) * job.image_width;
+      const int32_t* last = last_ids + job.first_pixel + int64_t(row) * job.image_width;
       for (int x = 0; x < job.width; ++x) most = std::max(most, last[x]);
     }
     used[owned] = most;
   });
 }
 
-// The owned tiles [begin, end) whose partial gradients are in memory together, and the number of these
-// gradients.
+// The owned tiles [begin, end) whose partial gradients are in memory together, and their number.
 struct Chunk {
-  std::int64_t begin, end;
-  std::int64_t partials;
+  int64_t begin, end;
+  int64_t partials;
 };
 
 // Divides the owned tiles into chunks and writes to places [owned tiles] the position of each tile's partial
 // gradients in the memory of its chunk.
-std::vector<Chunk> cut_chunks(const TileGrid& grid, const std::int32_t* used, std::int64_t* places) {
+std::vector<Chunk> cut_chunks(const TileGrid& grid, const int32_t* used, int64_t* places) {
   std::vector<Chunk> chunks;
-  for (std::int64_t tile = grid.tile_begin; tile < grid.tile_end; ++tile) {
-    const std::int64_t length = used[tile - grid.tile_begin];
+  for (int64_t tile = grid.tile_begin; tile < grid.tile_end; ++tile) {
+    const int64_t length = used[tile - grid.tile_begin];
     if (chunks.empty() || chunks.back().partials + length > kPartialsPerChunk) {
       chunks.push_back({tile, tile, 0});
     }
@@ -66,16 +58,16 @@ std::vector<Chunk> cut_chunks(const TileGrid& grid, const std::int32_t* used, st
 // Adds the partial gradients of a chunk to the sums [P, width]. One thread adds all those of a splat, in the
 // order of the tiles.
 template <class T>
-void add_partials(const RasterizeInput<T>& in, const Chunk& chunk, const std::int32_t* used,
-                  const T* partials, int width, T* sums) {
-  parallel_for(0, in.n_splats, 1 << 12, [&](std::int64_t begin, std::int64_t end) {
+void add_partials(const RasterizeInput<T>& in, const Chunk& chunk, const int32_t* used, const T* partials,
+                  int width, T* sums) {
+  parallel_for(0, in.n_splats, 1 << 12, [&](int64_t begin, int64_t end) {
     const T* partial = partials;
-    for (std::int64_t tile = chunk.begin; tile < chunk.end; ++tile) {
-      const std::int32_t* list = in.isect_splats + in.tile_offsets[tile];
-      const std::int32_t length = used[tile - in.grid.tile_begin];
-      for (std::int32_t entry = 0; entry < length; ++entry, partial += width) {
-        __builtin_prefetch(sums + static_cast<std::int64_t>(list[std::min(entry + 8, length - 1)]) * width);
-        const std::int64_t splat = list[entry];
+    for (int64_t tile = chunk.begin; tile < chunk.end; ++tile) {
+      const int32_t* list = in.isect_splats + in.tile_offsets[tile];
+      const int32_t length = used[tile - in.grid.tile_begin];
+      for (int32_t entry = 0; entry < length; ++entry, partial += width) {
+        __builtin_prefetch(sums + int64_t(list[std::min(entry + 8, length - 1)]) * width);
+        const int64_t splat = list[entry];
         if (splat < begin || splat >= end) continue;
         T* sum = sums + splat * width;
         for (int i = 0; i < width; ++i) sum[i] += partial[i];
@@ -87,7 +79,7 @@ void add_partials(const RasterizeInput<T>& in, const Chunk& chunk, const std::in
 template <class T>
 void write_gradients(const RasterizeInput<T>& in, const T* sums, int width,
                      const RasterizeGradients<T>& gradients) {
-  parallel_rows(in.n_splats, 1 << 12, [&](std::int64_t splat) {
+  parallel_rows(in.n_splats, 1 << 12, [&](int64_t splat) {
     const T* sum = sums + splat * width;
     std::copy_n(sum + kMeanX, 2, gradients.v_means2d + 2 * splat);
     std::copy_n(sum + kConicA, 3, gradients.v_conics + 3 * splat);
@@ -101,9 +93,8 @@ void write_gradients(const RasterizeInput<T>& in, const T* sums, int width,
 
 }  // namespace
 
-// Memory for prepared splats in float32. In float64, which serves for checks, the backward pass prepares the
-// splats again.
-std::int64_t rasterize_splat_bytes(int) { return sizeof(PreparedSplat<float>); }
+// Memory for prepared splats in float32. In float64, for checks, the backward pass prepares them again.
+int64_t rasterize_splat_bytes(int) { return sizeof(PreparedSplat<float>); }
 
 bool rasterize_orders_tiles(const TileGrid&) { return false; }
 
@@ -116,8 +107,8 @@ void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, c
                                      : allocate_splats<T>(in.n_splats, workspace));
   const TileKernels<T> kernels = tile_kernels<T>(in.n_channels, false);
   const TileMemory<T> memory(in, workspace);
-  parallel_tasks(in.grid.tile_end - in.grid.tile_begin, [&](std::int64_t task, int worker) {
-    const std::int64_t tile = in.grid.tile_begin + task;
+  parallel_tasks(in.grid.tile_end - in.grid.tile_begin, [&](int64_t task, int worker) {
+    const int64_t tile = in.grid.tile_begin + task;
     TileJob<T> job = make_job(in, splats, tile);
     job.out = out;
     memory.lend(worker, &job);
@@ -126,17 +117,17 @@ void rasterize_fwd(const RasterizeInput<T>& in, const RasterizeOutput<T>& out, c
 }
 
 template <class T>
-void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, std::int64_t,
+void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, int64_t,
                    const RasterizeAux& aux, bool, const RasterizeGradients<T>& gradients,
                    Workspace& workspace, CudaStream) {
   const bool absgrad = gradients.v_means2d_abs != nullptr;
   const int width = partial_width(in.n_channels, absgrad);
-  const std::int64_t n_owned = in.grid.tile_end - in.grid.tile_begin;
-  auto* used = workspace.allocate<std::int32_t>(n_owned);
-  auto* places = workspace.allocate<std::int64_t>(n_owned);
+  const int64_t n_owned = in.grid.tile_end - in.grid.tile_begin;
+  auto* used = workspace.allocate<int32_t>(n_owned);
+  auto* places = workspace.allocate<int64_t>(n_owned);
   find_used_entries(in, saved.last_ids, used);
   const std::vector<Chunk> chunks = cut_chunks(in.grid, used, places);
-  std::int64_t most = 0;
+  int64_t most = 0;
   for (const Chunk& chunk : chunks) most = std::max(most, chunk.partials);
   auto* partials = workspace.allocate<T>(most * width);
   auto* sums = workspace.allocate<T>(in.n_splats * width);
@@ -147,8 +138,8 @@ void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, 
   const TileKernels<T> kernels = tile_kernels<T>(in.n_channels, absgrad);
   const TileMemory<T> memory(in, workspace);
   for (const Chunk& chunk : chunks) {
-    parallel_tasks(chunk.end - chunk.begin, [&](std::int64_t task, int worker) {
-      const std::int64_t tile = chunk.begin + task, owned = tile - in.grid.tile_begin;
+    parallel_tasks(chunk.end - chunk.begin, [&](int64_t task, int worker) {
+      const int64_t tile = chunk.begin + task, owned = tile - in.grid.tile_begin;
       if (used[owned] == 0) return;
       TileJob<T> job = make_job(in, splats, tile);
       job.n_entries = used[owned];
@@ -161,16 +152,6 @@ void rasterize_bwd(const RasterizeInput<T>& in, const RasterizeSaved<T>& saved, 
   write_gradients(in, sums, width, gradients);
 }
 
-#define BLITZGS_INSTANTIATE(T)                                                                             \
-  template void rasterize_fwd<T>(const RasterizeInput<T>&, const RasterizeOutput<T>&, const RasterizeAux&, \
-                                 Workspace&, CudaStream);                                                  \
-  template void rasterize_bwd<T>(const RasterizeInput<T>&, const RasterizeSaved<T>&, std::int64_t,         \
-                                 const RasterizeAux&, bool, const RasterizeGradients<T>&, Workspace&,      \
-                                 CudaStream);
-BLITZGS_INSTANTIATE(float)
-BLITZGS_INSTANTIATE(double)
-#undef BLITZGS_INSTANTIATE
-
 template <class T>
 void pixel_splats(const RasterizeInput<T>& in, const PixelSplats<T>& out, Workspace& workspace, CudaStream) {
   for_each_colorless_tile(in, workspace, [&](const TileKernels<T>& kernels, const TileJob<T>& tile) {
@@ -178,9 +159,8 @@ void pixel_splats(const RasterizeInput<T>& in, const PixelSplats<T>& out, Worksp
   });
 }
 
-template void pixel_splats<float>(const RasterizeInput<float>&, const PixelSplats<float>&, Workspace&,
-                                  CudaStream);
-template void pixel_splats<double>(const RasterizeInput<double>&, const PixelSplats<double>&, Workspace&,
-                                   CudaStream);
+BLITZGS_FOR_BOTH_DTYPES(rasterize_fwd);
+BLITZGS_FOR_BOTH_DTYPES(rasterize_bwd);
+BLITZGS_FOR_BOTH_DTYPES(pixel_splats);
 
 }  // namespace blitzgs::cpu

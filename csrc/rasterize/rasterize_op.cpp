@@ -1,22 +1,19 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "rasterize/rasterize_op.h"
 
-#include <tuple>
-
 namespace blitzgs {
 namespace {
 
-// Runs the forward pass. It sets splat_gradients to zero if they are given.
 Tensors<6> composite(const ListedSplats& splats, const OptionalTensor& splat_gradients, bool clear_rest) {
   const TileGrid& grid = splats.grid;
   const Tensor& like = splats.means2d;
-  const std::int64_t composited = grid.tile_end - grid.tile_begin;
+  const int64_t composited = grid.tile_end - grid.tile_begin;
   const bool orders = backend::rasterize_orders_tiles(grid);
-  const auto last_ids = make<std::int32_t>(like, {grid.n_cameras, grid.height, grid.width}),
-             tile_work = make<std::int32_t>(like, {grid.count()}),
-             order = make<std::int32_t>(like, {orders ? 1 + composited : 0, kTileOrderClasses});
-  const auto packed = make<std::uint8_t>(
-      like, {splats.n_splats, backend::rasterize_splat_bytes(static_cast<int>(splats.n_channels))});
+  const auto last_ids = make<int32_t>(like, {grid.n_cameras, grid.height, grid.width}),
+             tile_work = make<int32_t>(like, {grid.count()}),
+             order = make<int32_t>(like, {orders ? 1 + composited : 0, kTileOrderClasses});
+  const auto packed =
+      make<uint8_t>(like, {splats.n_splats, backend::rasterize_splat_bytes(int(splats.n_channels))});
   DeviceScope scope(like);
   return dispatch_floating(like, [&]<class T>() -> Tensors<6> {
     const auto renders = make<T>(like, {grid.n_cameras, grid.height, grid.width, splats.n_channels}),
@@ -72,14 +69,13 @@ Tensors<5> rasterize_bwd(const TensorList& splats_in, const OptionalTensor& back
   splats.set_colors(splats_in[3], backgrounds);
   if (gradients) check_gradients(splats, *gradients);
   BLITZGS_CHECK(!gradients || !v_alphas_in, "v_alphas needs gradients in columns");
-  const auto last_ids = checked<std::int32_t>("last_ids", composited[1], {n_cameras, height, width});
-  const auto order = checked_in_place<std::int32_t>("tile_order", composited[3], {-1, kTileOrderClasses});
-  const auto packed = checked_in_place<std::uint8_t>(
-      "packed_splats", composited[2],
-      {-1, backend::rasterize_splat_bytes(static_cast<int>(splats.n_channels))});
+  const auto last_ids = checked<int32_t>("last_ids", composited[1], {n_cameras, height, width});
+  const auto order = checked_in_place<int32_t>("tile_order", composited[3], {-1, kTileOrderClasses});
+  const auto packed = checked_in_place<uint8_t>("packed_splats", composited[2],
+                                                {-1, backend::rasterize_splat_bytes(int(splats.n_channels))});
   const bool ordered = order.size(0) > 0;
   // The number of tiles that the forward pass composited.
-  const std::int64_t tiles = ordered ? order.size(0) - 1 : grid.count();
+  const int64_t tiles = ordered ? order.size(0) - 1 : grid.count();
   BLITZGS_CHECK(packed.size(0) >= splats.n_splats && tiles >= grid.tile_end - grid.tile_begin &&
                     reinterpret_cast<std::uintptr_t>(packed.data()) % 64 == 0,
                 "packed_splats and tile_order must be as rasterize_fwd returned them, for ", splats.n_splats,
@@ -87,7 +83,7 @@ Tensors<5> rasterize_bwd(const TensorList& splats_in, const OptionalTensor& back
                 " and ", tiles);
   const RasterizeAux aux{packed, packed.size(0), order.data_if(ordered), tiles};
   const Tensor& like = splats.means2d;
-  const std::int64_t n_splats = gradients ? 0 : splats.n_splats, n_isects = splats.isect_splats.size(0);
+  const int64_t n_splats = gradients ? 0 : splats.n_splats, n_isects = splats.isect_splats.size(0);
   DeviceScope scope(like);
   return dispatch_floating(like, [&]<class T>() -> Tensors<5> {
     const auto transmittances = checked<T>("transmittances", composited[0], {n_cameras, height, width}),
@@ -128,26 +124,24 @@ Tensors<6> rasterize_fwd_into(const Tensor& means2d, const Tensor& conics, const
 
 Tensors<5> pixel_splats(const Tensor& means2d, const Tensor& conics, const Tensor& opacities,
                         const Tensor& isect_splats, const Tensor& tile_offsets,
-                        const OptionalTensor& slots_in, std::int64_t n_rows, std::int64_t n_cameras,
-                        std::int64_t width, std::int64_t height, std::int64_t tile_size,
-                        std::int64_t strongest) {
+                        const OptionalTensor& slots_in, int64_t n_rows, int64_t n_cameras, int64_t width,
+                        int64_t height, int64_t tile_size, int64_t strongest) {
   const TileGrid grid = checked_tile_grid(n_cameras, width, height, tile_size, 0, -1);
   const ListedSplats splats(means2d, conics, opacities, isect_splats, tile_offsets, grid);
-  const auto slots = checked<std::int32_t>("slots", slots_in, {n_cameras, height, width});
+  const auto slots = checked<int32_t>("slots", slots_in, {n_cameras, height, width});
   BLITZGS_CHECK(strongest >= 0 && strongest < (1 << 24), "strongest must be 0 to 2^24 - 1, got ", strongest);
   BLITZGS_CHECK(slots ? n_rows >= 0 : n_rows == n_cameras * width * height,
                 "n_rows must be the number of rows that slots name, and without slots the number of "
                 "pixels, got ",
                 n_rows);
-  const auto counts = make<std::int32_t>(means2d, {n_rows}), medians = make<std::int32_t>(means2d, {n_rows}),
-             ids = make<std::int32_t>(means2d, {n_rows, strongest});
+  const auto counts = make<int32_t>(means2d, {n_rows}), medians = make<int32_t>(means2d, {n_rows}),
+             ids = make<int32_t>(means2d, {n_rows, strongest});
   DeviceScope scope(means2d);
   return dispatch_floating(means2d, [&]<class T>() -> Tensors<5> {
     const auto transmittances = make<T>(means2d, {n_rows}), weights = make<T>(means2d, {n_rows, strongest});
-    backend::pixel_splats<T>(
-        splats.input<T>(),
-        {slots, n_rows, static_cast<int>(strongest), transmittances, counts, medians, ids, weights},
-        scope.workspace, scope.stream);
+    backend::pixel_splats<T>(splats.input<T>(),
+                             {slots, n_rows, int(strongest), transmittances, counts, medians, ids, weights},
+                             scope.workspace, scope.stream);
     return {transmittances, counts, medians, ids, weights};
   });
 }

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // What the ops that composite splats share: the checked splats, and the ops that others call.
 #pragma once
-#include <algorithm>
-
 #include "common/op.h"
 #include "rasterize/rasterize.h"
 
@@ -37,39 +35,36 @@ struct ListedSplats {
     backgrounds = checked("backgrounds", backgrounds_in, dtype, {grid.n_cameras, n_channels});
   }
 
-  template <class T>
-  RasterizeInput<T> input() const {
+  template <class T> RasterizeInput<T> input() const {
     return {data<T>(means2d),
             data<T>(conics),
             data<T>(opacities),
             data_or_null<T>(colors),
             data_or_null<T>(backgrounds),
-            data<std::int32_t>(isect_splats),
-            data<std::int64_t>(tile_offsets),
+            data<int32_t>(isect_splats),
+            data<int64_t>(tile_offsets),
             splat_count.n_splats,
-            static_cast<int>(n_channels),
+            int(n_channels),
             grid,
             splat_count.known_splats};
   }
 
   // Lists of another call, or of other splats, would lead the kernels out of the tensors.
   void check_lists() const {
-    const auto* const offsets = data<std::int64_t>(tile_offsets);
-    const auto* const list = data<std::int32_t>(isect_splats);
-    const std::int64_t tiles = grid.count(), entries = isect_splats.size(0);
+    const auto* const offsets = data<int64_t>(tile_offsets);
+    const auto* const list = data<int32_t>(isect_splats);
+    const int64_t tiles = grid.count(), entries = isect_splats.size(0);
     BLITZGS_CHECK(
         offsets[0] >= 0 && offsets[tiles] <= entries && std::is_sorted(offsets, offsets + tiles + 1),
         "tile_offsets must ascend from 0 to at most the ", entries, " entries of isect_splats");
-    std::uint32_t largest = 0;  // a negative number becomes a large one
-    for (std::int64_t i = offsets[0]; i < offsets[tiles]; ++i) {
-      largest = std::max(largest, static_cast<std::uint32_t>(list[i]));
-    }
+    uint32_t largest = 0;  // a negative number becomes a large one
+    for (int64_t i = offsets[0]; i < offsets[tiles]; ++i) largest = std::max(largest, uint32_t(list[i]));
     BLITZGS_CHECK(offsets[tiles] == offsets[0] || largest < n_splats, "isect_splats must be numbers of the ",
                   n_splats, " splats");
   }
 
   TileGrid grid;
-  std::int64_t n_splats, n_channels = 0;  // n_splats: the length of the columns
+  int64_t n_splats, n_channels = 0;  // n_splats: the length of the columns
   SplatCount splat_count;
   Tensor means2d, conics, opacities, isect_splats, tile_offsets;
   OptionalTensor colors, backgrounds;
@@ -77,7 +72,7 @@ struct ListedSplats {
 
 Tensors<2> intersect(const Tensor& means2d, const Tensor& conics, const Tensor& splat_opacities,
                      const Tensor& depths, const Tensor& camera_ids, const OptionalTensor& ids, BLITZGS_TILES,
-                     std::int64_t n_isects, const OptionalTensor& known_splats, bool unchecked);
+                     int64_t n_isects, const OptionalTensor& known_splats, bool unchecked);
 
 Tensors<7> rasterize_fwd(const Tensor& means2d, const Tensor& conics, const Tensor& splat_opacities,
                          const Tensor& colors, const OptionalTensor& backgrounds, const Tensor& isect_splats,

@@ -3,17 +3,10 @@
 // alpha (docs/image.md, section 3), and how a block reads a batch of its tile's list.
 //
 // A block composites a tile of 16x16 pixels, a half-warp a subtile of 4x4, a lane a pixel. The block copies
-// the tile's list to shared memory in batches. Each thread tests one entry against all sixteen subtiles, and
-// from these tests each half-warp makes the list of the entries that may touch its subtile: a splat of a few
-// pixels touches about three subtiles. The two halves of a warp visit different lists in lockstep. The test
-// is conservative, so it changes no pixel.
+// the tile's list to shared memory in batches. Each thread tests one entry against all sixteen subtiles,
+// conservatively, and from these tests each half-warp makes the list of the entries that may touch its
+// subtile: a splat of a few pixels touches about three. A warp's halves visit their lists in lockstep.
 #pragma once
-#include <algorithm>
-#include <cstdint>
-#include <stdexcept>
-#include <string>
-
-#include "common/cuda.cuh"
 #include "math/tiles.h"
 #include "rasterize/rasterize.h"
 #include "rasterize/tile_order.cuh"
@@ -71,8 +64,8 @@ struct ChunkInput {
   const PackedSplat* splats;
   ChannelChunk chunk;
   const float* backgrounds;
-  const std::int32_t* isect_splats;
-  const std::int64_t* tile_offsets;
+  const int32_t* isect_splats;
+  const int64_t* tile_offsets;
   TileGrid grid;
   TileOrder order;
 
@@ -89,23 +82,23 @@ struct ChunkInput {
 
 // Asynchronous copies to shared memory. The thread that starts them waits for them with copies_done().
 __device__ __forceinline__ void copy_quad(void* shared, const void* global) {
-  const auto address = static_cast<std::uint32_t>(__cvta_generic_to_shared(shared));
+  const auto address = uint32_t(__cvta_generic_to_shared(shared));
   asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(address), "l"(global) : "memory");
 }
 
 __device__ __forceinline__ void copy_float(void* shared, const void* global) {
-  const auto address = static_cast<std::uint32_t>(__cvta_generic_to_shared(shared));
+  const auto address = uint32_t(__cvta_generic_to_shared(shared));
   asm volatile("cp.async.ca.shared.global [%0], [%1], 4;" ::"r"(address), "l"(global) : "memory");
 }
 
 __device__ __forceinline__ void copies_done() { asm volatile("cp.async.wait_all;" ::: "memory"); }
 
-__device__ __forceinline__ void copy_color(float* shared, const ChannelChunk& chunk, std::int32_t splat) {
+__device__ __forceinline__ void copy_color(float* shared, const ChannelChunk& chunk, int32_t splat) {
   if (chunk.packed) {
     copy_quad(shared, chunk.packed + splat);
     return;
   }
-  const float* color = chunk.colors + static_cast<std::int64_t>(splat) * chunk.n_channels + chunk.first;
+  const float* color = chunk.colors + int64_t(splat) * chunk.n_channels + chunk.first;
   for (int k = 0; k < 4; ++k) {
     if (k < chunk.count) {
       copy_float(shared + k, color + k);
@@ -123,7 +116,7 @@ __device__ __forceinline__ float channel(const float4& c, int k) {
 // rounds both correctly; it serves to measure the difference (benchmarks/bm_accuracy.py).
 __device__ __forceinline__ float exp2_approx(float x) {
 #ifdef BLITZGS_EXACT_EXP
-  return static_cast<float>(exp2(static_cast<double>(x)));
+  return float(exp2(double(x)));
 #else
   float y;
   asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
@@ -155,30 +148,29 @@ struct Tile {
   static_assert(kSubtiles <= 32);  // the bits of a word
 };
 
-// The position of a thread's pixel.
 struct Pixel {
-  int x, y;            // in the image
-  int subtile;         // the index of its subtile in the tile
-  bool inside;         // whether the pixel is inside the image
-  std::int64_t index;  // (camera, y, x) flattened
-  float dx, dy;        // from the tile's centre to the pixel's centre: multiples of 1/2, so exact
+  int x, y;       // in the image
+  int subtile;    // the index of its subtile in the tile
+  bool inside;    // whether the pixel is inside the image
+  int64_t index;  // (camera, y, x) flattened
+  float dx, dy;   // from the tile's centre to the pixel's centre: multiples of 1/2, so exact
 };
 
 struct TilePlace {
-  std::int64_t tile;
+  int64_t tile;
   int camera, left, top;
 };
 
-__device__ __forceinline__ TilePlace locate_tile(const TileGrid& grid, std::int64_t tile) {
+__device__ __forceinline__ TilePlace locate_tile(const TileGrid& grid, int64_t tile) {
   TilePlace place;
   place.tile = tile;
   // There is a block for each tile, so tile numbers fit 32 bits, in which division is faster.
-  const auto number = static_cast<std::uint32_t>(tile), columns = static_cast<std::uint32_t>(grid.tiles_x);
-  const auto per_image = static_cast<std::uint32_t>(grid.per_image());
-  const std::uint32_t in_image = number % per_image;
-  place.camera = static_cast<int>(number / per_image);
-  place.top = static_cast<int>(in_image / columns * kTileSize);
-  place.left = static_cast<int>(in_image % columns * kTileSize);
+  const auto number = uint32_t(tile), columns = uint32_t(grid.tiles_x);
+  const auto per_image = uint32_t(grid.per_image());
+  const uint32_t in_image = number % per_image;
+  place.camera = int(number / per_image);
+  place.top = int(in_image / columns * kTileSize);
+  place.left = int(in_image % columns * kTileSize);
   return place;
 }
 
@@ -193,9 +185,9 @@ __device__ __forceinline__ Pixel locate_pixel(const TileGrid& grid, const TilePl
   pixel.x = place.left + x;
   pixel.y = place.top + y;
   pixel.inside = pixel.x < grid.width && pixel.y < grid.height;
-  pixel.index = (static_cast<std::int64_t>(place.camera) * grid.height + pixel.y) * grid.width + pixel.x;
-  pixel.dx = static_cast<float>(x) + (0.5f - kTileSize / 2);
-  pixel.dy = static_cast<float>(y) + (0.5f - kTileSize / 2);
+  pixel.index = (int64_t(place.camera) * grid.height + pixel.y) * grid.width + pixel.x;
+  pixel.dx = float(x) + (0.5f - kTileSize / 2);
+  pixel.dy = float(y) + (0.5f - kTileSize / 2);
   return pixel;
 }
 
@@ -205,19 +197,19 @@ __device__ __forceinline__ float clamp_between(float value, float low, float hig
 
 // The lowest bits of the result are those of the least integer >= scale * value + shift, for results below
 // 2^22 in magnitude: adding 1.5 * 2^23 shifts the fraction out of the significand.
-__device__ __forceinline__ std::uint32_t ceil_bits(float scale, float value, float shift) {
+__device__ __forceinline__ uint32_t ceil_bits(float scale, float value, float shift) {
   return __float_as_uint(__fmaf_ru(scale, value, shift + 12582912.f));
 }
 
 // Returns one bit per subtile, row by row: whether alpha may reach 1/255 at one of the subtile's pixel
 // centres. The points with alpha >= 1/255 form an ellipse. Its part in a row of subtiles spans an interval of
 // x whose ends have a closed form (as in math/tiles.h).
-__device__ __forceinline__ std::uint32_t subtile_mask(const PackedSplat& splat, const TilePlace& place) {
+__device__ __forceinline__ uint32_t subtile_mask(const PackedSplat& splat, const TilePlace& place) {
   constexpr int kColumns = Tile::kColumns;
-  constexpr std::uint32_t kRow = (1u << kColumns) - 1u;
+  constexpr uint32_t kRow = (1u << kColumns) - 1u;
   // From the centre of the tile's first pixel to the mean.
-  const float x = splat.x - (static_cast<float>(place.left) + 0.5f);
-  const float y = splat.y - (static_cast<float>(place.top) + 0.5f);
+  const float x = splat.x - (float(place.left) + 0.5f);
+  const float y = splat.y - (float(place.top) + 0.5f);
   // The slack covers the rounding of this test and of log2_alpha().
   const float terms = fabsf(splat.l11) * (fabsf(x) + kTileSize) + fabsf(splat.l21) * (fabsf(y) + kTileSize);
   const float cut = (splat.log2_opacity - kLog2Cut) * 1.00003f + 3e-5f + 2e-6f * terms;
@@ -225,10 +217,10 @@ __device__ __forceinline__ std::uint32_t subtile_mask(const PackedSplat& splat, 
   const float inverse = 1.000003f * reciprocal_approx(splat.l11);
   const float turn = splat.turn * sqrt_approx(cut);
   const float left = x - slack - (kSubtile - 1), right = x + slack;
-  std::uint32_t mask = 0;
+  uint32_t mask = 0;
 #pragma unroll
   for (int i = 0; i < kColumns; ++i) {
-    const float y0 = static_cast<float>(i * kSubtile) - y, y1 = y0 + (kSubtile - 1);
+    const float y0 = float(i * kSubtile) - y, y1 = y0 + (kSubtile - 1);
     const float dy_left = clamp_between(-turn, y0, y1), dy_right = clamp_between(turn, y0, y1);
     const float v_left = splat.l22 * dy_left, v_right = splat.l22 * dy_right;
     const float rest_left = cut - v_left * v_left, rest_right = cut - v_right * v_right;
@@ -237,11 +229,11 @@ __device__ __forceinline__ std::uint32_t subtile_mask(const PackedSplat& splat, 
     const float end_left = splat.dx_per_dy * dy_left - reach_left + left;
     const float end_right = splat.dx_per_dy * dy_right + reach_right + right;
     // Subtile c has the pixels 4 c to 4 c + 3. fminf and fmaxf replace a NaN bound by the edge of the tile.
-    const std::uint32_t skip_left =
-        ceil_bits(0.25f, fminf(fmaxf(end_left, 1.f - kSubtile), static_cast<float>(kTileSize)), 0.f);
-    const std::uint32_t skip_right =
-        ceil_bits(-0.25f, fmaxf(fminf(end_right, static_cast<float>(kTileSize - 1)), -4.f), kColumns - 1.f);
-    const std::uint32_t bits = __funnelshift_l(0u, kRow, skip_left) & __funnelshift_r(kRow, 0u, skip_right);
+    const uint32_t skip_left =
+        ceil_bits(0.25f, fminf(fmaxf(end_left, 1.f - kSubtile), float(kTileSize)), 0.f);
+    const uint32_t skip_right =
+        ceil_bits(-0.25f, fmaxf(fminf(end_right, float(kTileSize - 1)), -4.f), kColumns - 1.f);
+    const uint32_t bits = __funnelshift_l(0u, kRow, skip_left) & __funnelshift_r(kRow, 0u, skip_right);
     if (rest_right >= 0.f) mask |= bits << i * kColumns;
   }
   return mask;
@@ -274,15 +266,14 @@ __device__ __forceinline__ float log2_alpha(const Entry& entry, const Pixel& pix
 // for each batch place(this batch), barrier, fetch(next batch), list(this batch). One barrier per batch is
 // enough: the data that fetch() overwrites was last read before this barrier, and the data that place()
 // overwrites was last read before the previous one.
-template <int BATCH>
-struct EntryBatch {
+template <int BATCH> struct EntryBatch {
   static constexpr int kWords = BATCH / 32;
   static constexpr int kLaneBits =
       BATCH / kHalfWarp;  // entries of the batch that each lane of list() handles
-  static constexpr std::uint32_t kNothing = BATCH * sizeof(Entry);
+  static constexpr uint32_t kNothing = BATCH * sizeof(Entry);
   Entry entries[2][BATCH + 1];
-  std::uint32_t hits[2][Tile::kSubtiles][kWords];
-  std::uint16_t lists[Tile::kSubtiles][BATCH + 4];
+  uint32_t hits[2][Tile::kSubtiles][kWords];
+  uint16_t lists[Tile::kSubtiles][BATCH + 4];
 
   // Writes the entries that touch no pixel. Called once per block, before the first barrier.
   __device__ __forceinline__ void init(int thread) {
@@ -295,7 +286,7 @@ struct EntryBatch {
   // has no such entry. `chunk` is an argument of copy_color().
   template <class Chunk>
   __device__ __forceinline__ void fetch(int buffer, const PackedSplat* splats, const Chunk& chunk,
-                                        std::int32_t splat, int at) {
+                                        int32_t splat, int at) {
     if (splat < 0) return;
     auto* target = reinterpret_cast<float4*>(&entries[buffer][at]);
     const auto* source = reinterpret_cast<const float4*>(splats + splat);
@@ -309,12 +300,12 @@ struct EntryBatch {
   __device__ __forceinline__ void place(int buffer, bool present, const TilePlace& tile, int at) {
     const int lane = at & 31;
     copies_done();
-    std::uint32_t mask = 0;
+    uint32_t mask = 0;
     if (present) {
       auto* target = reinterpret_cast<float4*>(&entries[buffer][at]);
       const float4 a = target[0], b = target[1];
-      const float x = a.x - static_cast<float>(tile.left + kTileSize / 2);
-      const float y = a.y - static_cast<float>(tile.top + kTileSize / 2);
+      const float x = a.x - float(tile.left + kTileSize / 2);
+      const float y = a.y - float(tile.top + kTileSize / 2);
       target[0] = {a.z, a.w, -__fmaf_rn(a.z, x, __fmul_rn(a.w, y)), b.x};
       target[1] = {-__fmul_rn(b.x, y), b.y, a.x, a.y};
       mask = subtile_mask({a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w}, tile);
@@ -330,10 +321,10 @@ struct EntryBatch {
   __device__ __forceinline__ int list(int buffer, int subtile, int lane, int limit) {
     const int piece = BACKWARDS ? kHalfWarp - 1 - lane : lane;
     const int first = piece * kLaneBits;
-    std::uint32_t word = hits[buffer][subtile][first / 32];
+    uint32_t word = hits[buffer][subtile][first / 32];
     if constexpr (SHARED) word |= hits[buffer][subtile ^ 1][first / 32];
     const int wanted = min(max(limit - first, 0), kLaneBits);
-    std::uint32_t bits = word >> first % 32 & static_cast<std::uint32_t>((std::uint64_t{1} << wanted) - 1);
+    uint32_t bits = word >> first % 32 & uint32_t((uint64_t{1} << wanted) - 1);
     const int count = __popc(bits);
     int end = count;
 #pragma unroll
@@ -342,11 +333,11 @@ struct EntryBatch {
       if (lane >= step) end += before;
     }
     const int n = __shfl_sync(kFullWarp, end, kHalfWarp - 1, kHalfWarp);
-    std::uint16_t* target = lists[subtile] + (BACKWARDS ? end - count : end - 1);
+    uint16_t* target = lists[subtile] + (BACKWARDS ? end - count : end - 1);
     while (bits) {  // from the last entry of this lane's piece to the first
       const int bit = 31 - __clz(bits);
       bits ^= 1u << bit;
-      *target = static_cast<std::uint16_t>((first + bit) * static_cast<int>(sizeof(Entry)));
+      *target = uint16_t((first + bit) * int(sizeof(Entry)));
       target += BACKWARDS ? 1 : -1;
     }
     const int quads = (max(n, __shfl_xor_sync(kFullWarp, n, kHalfWarp)) + 3) / 4;
@@ -361,12 +352,12 @@ struct EntryBatch {
   }
 };
 
-__device__ __forceinline__ const Entry& entry_at(const char* entries, std::uint32_t offset) {
+__device__ __forceinline__ const Entry& entry_at(const char* entries, uint32_t offset) {
   return *reinterpret_cast<const Entry*>(entries + offset);
 }
 
 struct QuadOffsets {
-  std::uint32_t at[4];
+  uint32_t at[4];
   __device__ __forceinline__ explicit QuadOffsets(uint2 packed)
       : at{packed.x & 0xffffu, packed.x >> 16, packed.y & 0xffffu, packed.y >> 16} {}
 };

@@ -1,15 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 // Compositing one tile on the CPU, front to back (docs/image.md, sections 3 and 5). A sink takes the weights
 // alpha T: ColorSink makes the image, ContributionSink the contributions of splats, PixelSink those of
-// pixels. Compiled twice, plain and with AVX2 (tile_kernels.h); both and their callers share plain data
-// alone.
+// pixels. Compiled twice, plain and with AVX2 (tile_kernels.h); they share plain data alone.
 #pragma once
 #include <algorithm>
 #include <atomic>
-#include <bit>
-#include <cmath>
-#include <cstddef>
-#include <cstdint>
 
 #include "importance/importance.h"
 #include "math/lanes.h"
@@ -27,8 +22,7 @@ constexpr T kExponentScale = sizeof(T) == 4 ? T(0.72134752044448170f) : T(0.5); 
 // A splat prepared for the kernels, one cache line in float32. It may touch pixels with u^2 + w^2 <= cut, in
 // rows within half_height of y (-1: no row). In the row at dy, these pixels are centred on x - shear dy, with
 // a half width of sqrt(cut - w^2) * inv_l11 + slack.
-template <class T>
-struct alignas(64) PreparedSplat {
+template <class T> struct alignas(64) PreparedSplat {
   T x, y, l11, l21, l22, opacity, cut, inv_l11, shear, half_height, slack;
   T color[kPackedChannels];
 };
@@ -40,26 +34,25 @@ struct PlaneLayout {
 };
 
 // The scratch numbers of a tile: two planes, one plane per channel, and a row of pixel centres.
-inline std::size_t tile_memory(int tile_size, int n_channels) {
+inline size_t tile_memory(int tile_size, int n_channels) {
   const PlaneLayout layout(tile_size);
-  return static_cast<std::size_t>(layout.plane) * (2 + n_channels) + layout.stride;
+  return size_t(layout.plane) * (2 + n_channels) + layout.stride;
 }
 
-template <class T>
-struct TileJob {
+template <class T> struct TileJob {
   const PreparedSplat<T>* splats;
   const T* colors;      // [P, D], for more than kPackedChannels channels
   const T* background;  // [D] or null
-  const std::int32_t* list;
-  std::int32_t n_entries;
+  const int32_t* list;
+  int32_t n_entries;
   int n_channels, tile_size;
   int x0, y0, width, height;  // the tile's pixels within the image
   int image_width;
-  std::int64_t first_pixel;   // index of (x0, y0) in [B, H, W]
-  RasterizeOutput<T> out;     // forward
-  RasterizeSaved<T> saved;    // backward
-  T* memory;                  // tile_memory() numbers
-  std::int32_t* last_memory;  // PlaneLayout::plane numbers
+  int64_t first_pixel;      // index of (x0, y0) in [B, H, W]
+  RasterizeOutput<T> out;   // forward
+  RasterizeSaved<T> saved;  // backward
+  T* memory;                // tile_memory() numbers
+  int32_t* last_memory;     // PlaneLayout::plane numbers
 };
 
 // The layout of one splat's partial gradient from one tile: these six numbers, then D colours, then, with
@@ -67,9 +60,8 @@ struct TileJob {
 enum PartialGradient { kMeanX, kMeanY, kConicA, kConicB, kConicC, kOpacity, kColor };
 constexpr int partial_width(int n_channels, bool absgrad) { return kColor + n_channels + (absgrad ? 2 : 0); }
 
-template <class T>
-struct TileKernels {
-  std::int32_t (*forward)(const TileJob<T>&);                      // returns the entries processed
+template <class T> struct TileKernels {
+  int32_t (*forward)(const TileJob<T>&);                           // returns the entries processed
   void (*backward)(const TileJob<T>&, T* partials);                // writes n_entries partial gradients
   void (*contribute)(const TileJob<T>&, const ContributionSums&);  // adds to the sums of all tiles
   void (*list_splats)(const TileJob<T>&, const PixelSplats<T>&);   // writes the rows of the tile's pixels
@@ -80,8 +72,7 @@ TileKernels<float> avx2_tile_kernels(int n_channels, bool absgrad);
 
 namespace {
 
-template <class Lanes>
-Lanes falloff(Lanes exponent) {
+template <class Lanes> Lanes falloff(Lanes exponent) {
   if constexpr (sizeof(typename Lanes::Scalar) == 4) {
     return exp2_nonpositive(exponent);
   } else {
@@ -91,29 +82,28 @@ Lanes falloff(Lanes exponent) {
 
 // A splat on each pixel row of a tile: the exponent of alpha at (dx, row) is -(l11 dx + shift)^2 + minus_w2,
 // and the splat may touch pixels [first, last] of the row.
-template <class T>
-struct RowSpans {
+template <class T> struct RowSpans {
   alignas(32) T dy[kMaxTileSize];
   alignas(32) T shift[kMaxTileSize];
   alignas(32) T minus_w2[kMaxTileSize];
-  alignas(32) std::int32_t first[kMaxTileSize];
-  alignas(32) std::int32_t last[kMaxTileSize];
+  alignas(32) int32_t first[kMaxTileSize];
+  alignas(32) int32_t last[kMaxTileSize];
 };
 
 // Fills spans and returns the rows that the splat may touch, one bit each.
 template <class Lanes, class T>
-std::uint64_t find_spans(const PreparedSplat<T>& splat, const TileJob<T>& tile, RowSpans<T>& spans) {
-  const T top = static_cast<T>(tile.y0) + T(0.5);
+uint64_t find_spans(const PreparedSplat<T>& splat, const TileJob<T>& tile, RowSpans<T>& spans) {
+  const T top = T(tile.y0) + T(0.5);
   const T low = splat.y - splat.half_height - top, high = splat.y + splat.half_height - top;
-  const T bottom = static_cast<T>(tile.height - 1);
-  const int row_begin = low > T(0) ? static_cast<int>(low < bottom ? low : bottom) / kLanes * kLanes : 0;
-  const int row_end = high >= T(0) ? static_cast<int>(high < bottom ? high : bottom) + 1 : 0;
+  const T bottom = T(tile.height - 1);
+  const int row_begin = low > T(0) ? int(low < bottom ? low : bottom) / kLanes * kLanes : 0;
+  const int row_end = high >= T(0) ? int(high < bottom ? high : bottom) + 1 : 0;
   const Lanes cut = Lanes::broadcast(splat.cut), zero = Lanes::zero();
-  const Lanes right = Lanes::broadcast(static_cast<T>(tile.width - 1));
-  const Lanes middle = Lanes::broadcast(splat.x - (static_cast<T>(tile.x0) + T(0.5)));
-  std::uint64_t rows = 0;
+  const Lanes right = Lanes::broadcast(T(tile.width - 1));
+  const Lanes middle = Lanes::broadcast(splat.x - (T(tile.x0) + T(0.5)));
+  uint64_t rows = 0;
   for (int row = row_begin; row < row_end; row += kLanes) {
-    const Lanes dy = Lanes::broadcast(top + static_cast<T>(row)) + Lanes::iota() - Lanes::broadcast(splat.y);
+    const Lanes dy = Lanes::broadcast(top + T(row)) + Lanes::iota() - Lanes::broadcast(splat.y);
     const Lanes w = Lanes::broadcast(splat.l22) * dy;
     const Lanes w2 = w * w;
     const Lanes rest = cut - w2;
@@ -128,52 +118,47 @@ std::uint64_t find_spans(const PreparedSplat<T>& splat, const TileJob<T>& tile, 
     first.to_int().store(spans.first + row);
     last.to_int().store(spans.last + row);
     const auto reached = Lanes::greater_equal(last, first) & Lanes::greater_equal(rest, zero);
-    rows |= static_cast<std::uint64_t>(reached.bits()) << row;
+    rows |= uint64_t(reached.bits()) << row;
   }
   return rows;
 }
 
 // The number of channels: D if D > 0, else that of the tile.
-template <int D, class T>
-int channels(const TileJob<T>& tile) {
+template <int D, class T> int channels(const TileJob<T>& tile) {
   if constexpr (D > 0) return D;
   return tile.n_channels;
 }
 
-template <int D, class T>
-const T* splat_color(const TileJob<T>& tile, std::int32_t index) {
+template <int D, class T> const T* splat_color(const TileJob<T>& tile, int32_t index) {
   if constexpr (D > 0 && D <= kPackedChannels) return tile.splats[index].color;
-  return tile.colors + static_cast<std::int64_t>(index) * channels<D>(tile);
+  return tile.colors + int64_t(index) * channels<D>(tile);
 }
 
 // The state of a tile's pixels in its memory: planes of zeros, and the pixel centres of a row.
-template <class State, class T>
-State start_planes(const TileJob<T>& tile, int n_channels) {
+template <class State, class T> State start_planes(const TileJob<T>& tile, int n_channels) {
   const PlaneLayout layout(tile.tile_size);
-  const std::ptrdiff_t plane = layout.plane, used = plane * (2 + n_channels);
+  const ptrdiff_t plane = layout.plane, used = plane * (2 + n_channels);
   T* memory = tile.memory;
   std::fill_n(memory, used, T(0));
   std::fill_n(tile.last_memory, plane, 0);
-  for (int x = 0; x < layout.stride; ++x) memory[used + x] = static_cast<T>(tile.x0 + x) + T(0.5);
+  for (int x = 0; x < layout.stride; ++x) memory[used + x] = T(tile.x0 + x) + T(0.5);
   return {layout, memory, memory + plane, memory + 2 * plane, memory + used, tile.last_memory};
 }
 
-template <class T>
-struct ForwardState {
+template <class T> struct ForwardState {
   PlaneLayout layout;
   T *transmittance, *ended, *color, *centres;
-  std::int32_t* last;
-  std::uint64_t alive_rows = 0;
-  std::int32_t alive_in_row[kMaxTileSize] = {};
+  int32_t* last;
+  uint64_t alive_rows = 0;
+  int32_t alive_in_row[kMaxTileSize] = {};
 };
 
-template <int D, class T>
-ForwardState<T> start_forward(const TileJob<T>& tile) {
+template <int D, class T> ForwardState<T> start_forward(const TileJob<T>& tile) {
   auto state = start_planes<ForwardState<T>>(tile, channels<D>(tile));
   for (int row = 0; row < tile.height; ++row) {
     std::fill_n(state.transmittance + row * state.layout.stride, tile.width, T(1));
     state.alive_in_row[row] = tile.width;
-    state.alive_rows |= std::uint64_t{1} << row;
+    state.alive_rows |= uint64_t{1} << row;
   }
   return state;
 }
@@ -181,21 +166,20 @@ ForwardState<T> start_forward(const TileJob<T>& tile) {
 // Ends pixels x + i of a row, for each bit i of `bits`. A pixel that has not ended has transmittance > 0 (it
 // starts at 1 and stays above the minimum). For a pixel that ends, the transmittance moves to `ended`, and a
 // transmittance of 0 marks it as ended.
-template <class T>
-void end_pixels(ForwardState<T>& state, int row, int x, unsigned bits) {
+template <class T> void end_pixels(ForwardState<T>& state, int row, int x, unsigned bits) {
   for (; bits; bits &= bits - 1) {
     const int pixel = row * state.layout.stride + x + std::countr_zero(bits);
     state.ended[pixel] = state.transmittance[pixel];
     state.transmittance[pixel] = T(0);
-    if (--state.alive_in_row[row] == 0) state.alive_rows &= ~(std::uint64_t{1} << row);
+    if (--state.alive_in_row[row] == 0) state.alive_rows &= ~(uint64_t{1} << row);
   }
 }
 
 // Composites a splat at eight pixels of a row and gives the sink their weights alpha T, zero for pixels at
 // which the splat is not composited.
 template <class Lanes, class T, class Sink>
-inline void composite(const PreparedSplat<T>& splat, const RowSpans<T>& spans, std::int32_t entry, int row,
-                      int x, ForwardState<T>& state, Sink& sink) {
+inline void composite(const PreparedSplat<T>& splat, const RowSpans<T>& spans, int32_t entry, int row, int x,
+                      ForwardState<T>& state, Sink& sink) {
   const int pixel = row * state.layout.stride + x;
   const Lanes before = Lanes::load(state.transmittance + pixel);
   const auto running = Lanes::greater(before, Lanes::zero());
@@ -209,18 +193,17 @@ inline void composite(const PreparedSplat<T>& splat, const RowSpans<T>& spans, s
   const auto drawn = touched & Lanes::greater_equal(after, Lanes::broadcast(T(kMinTransmittance)));
   sink.add(Lanes::keep(drawn, alpha * before), pixel);
   Lanes::select(drawn, after, before).store(state.transmittance + pixel);
-  std::int32_t* last = state.last + pixel;
+  int32_t* last = state.last + pixel;
   Lanes::Int::select(drawn, Lanes::Int::broadcast(entry + 1), Lanes::Int::load(last)).store(last);
   const auto ending = touched.and_not(drawn);
   if (ending.any()) end_pixels(state, row, x, ending.bits());
 }
 
-template <int D, class T>
-void write_pixels(const TileJob<T>& tile, const ForwardState<T>& state) {
+template <int D, class T> void write_pixels(const TileJob<T>& tile, const ForwardState<T>& state) {
   for (int row = 0; row < tile.height; ++row) {
     for (int x = 0; x < tile.width; ++x) {
       const int pixel = row * state.layout.stride + x;
-      const std::int64_t out = tile.first_pixel + static_cast<std::int64_t>(row) * tile.image_width + x;
+      const int64_t out = tile.first_pixel + int64_t(row) * tile.image_width + x;
       const T running = state.transmittance[pixel];
       const T rest = running > T(0) ? running : state.ended[pixel];
       tile.out.transmittances[out] = rest;
@@ -236,21 +219,21 @@ void write_pixels(const TileJob<T>& tile, const ForwardState<T>& state) {
 
 // The hardware cannot predict which splats a list names, so the loops prefetch splats this many entries
 // ahead. Both loops contain the prefetch itself, because gcc drops calls of a function that only prefetches.
-constexpr std::int32_t kPrefetchDistance = 6;
+constexpr int32_t kPrefetchDistance = 6;
 
 // Composites the tile's list and returns the number of entries processed. For each entry it calls
 // sink.begin(splat), then sink.add(alpha T of eight pixels, the first of these pixels) for the pixels that
 // the splat may touch, then sink.end(splat).
 template <class Lanes, class T, class Sink>
-std::int32_t composite_list(const TileJob<T>& tile, ForwardState<T>& state, Sink& sink) {
+int32_t composite_list(const TileJob<T>& tile, ForwardState<T>& state, Sink& sink) {
   RowSpans<T> spans;
-  std::int32_t entry = 0;
+  int32_t entry = 0;
   for (; entry < tile.n_entries && state.alive_rows; ++entry) {
     __builtin_prefetch(tile.splats + tile.list[std::min(entry + kPrefetchDistance, tile.n_entries - 1)]);
-    const std::int32_t index = tile.list[entry];
+    const int32_t index = tile.list[entry];
     const PreparedSplat<T>& splat = tile.splats[index];
     sink.begin(index);
-    std::uint64_t rows = find_spans<Lanes>(splat, tile, spans) & state.alive_rows;
+    uint64_t rows = find_spans<Lanes>(splat, tile, spans) & state.alive_rows;
     for (; rows; rows &= rows - 1) {
       const int row = std::countr_zero(rows);
       for (int x = spans.first[row]; x <= spans.last[row]; x += kLanes) {
@@ -263,54 +246,51 @@ std::int32_t composite_list(const TileJob<T>& tile, ForwardState<T>& state, Sink
 }
 
 // Sums the colours of the splats, times their weights, in planes of pixels [D, plane].
-template <class Lanes, int D, class T>
-struct ColorSink {
+template <class Lanes, int D, class T> struct ColorSink {
   const TileJob<T>& tile;
   T* planes;
-  std::ptrdiff_t plane;
+  ptrdiff_t plane;
   const T* color = nullptr;
 
-  void begin(std::int32_t index) { color = splat_color<D>(tile, index); }
+  void begin(int32_t index) { color = splat_color<D>(tile, index); }
   void add(Lanes share, int pixel) const {
     for (int c = 0; c < channels<D>(tile); ++c) {
       T* sum = planes + c * plane + pixel;
       Lanes::fma(share, Lanes::broadcast(color[c]), Lanes::load(sum)).store(sum);
     }
   }
-  void end(std::int32_t) const {}
+  void end(int32_t) const {}
 };
 
 // Composites one tile of the image and writes its pixels. Returns the number of entries processed.
-template <class Lanes, int D>
-std::int32_t forward_tile(const TileJob<typename Lanes::Scalar>& tile) {
+template <class Lanes, int D> int32_t forward_tile(const TileJob<typename Lanes::Scalar>& tile) {
   using T = typename Lanes::Scalar;
   ForwardState<T> state = start_forward<D>(tile);
   ColorSink<Lanes, D, T> sink{tile, state.color, state.layout.plane};
-  const std::int32_t entries = composite_list<Lanes>(tile, state, sink);
+  const int32_t entries = composite_list<Lanes>(tile, state, sink);
   write_pixels<D>(tile, state);
   return entries;
 }
 
 // Sums the weights alpha T, their squares if these are wanted, and the pixels of each splat. The summands are
 // integers in units of 2^-32, so that the order of the tiles does not change the sums.
-template <class Lanes, class T>
-struct ContributionSink {
+template <class Lanes, class T> struct ContributionSink {
   const ContributionSums& sums;
-  std::int64_t weight = 0, squares = 0;
-  std::int32_t pixels = 0;
+  int64_t weight = 0, squares = 0;
+  int32_t pixels = 0;
 
-  void begin(std::int32_t) { weight = squares = pixels = 0; }
+  void begin(int32_t) { weight = squares = pixels = 0; }
   void add(Lanes share, int) {
     alignas(64) T shares[kLanes];
     share.store(shares);
     for (const T alpha_t : shares) {
-      const auto units = static_cast<std::uint64_t>(std::llrint(alpha_t * T(kContributionScale)));
-      weight += static_cast<std::int64_t>(units);
-      if (sums.squares) squares += static_cast<std::int64_t>(units * units >> 32);
+      const auto units = uint64_t(std::llrint(alpha_t * T(kContributionScale)));
+      weight += int64_t(units);
+      if (sums.squares) squares += int64_t(units * units >> 32);
       pixels += alpha_t > T(0);
     }
   }
-  void end(std::int32_t index) const {
+  void end(int32_t index) const {
     if (pixels == 0) return;
     std::atomic_ref(sums.weights[index]).fetch_add(weight, std::memory_order_relaxed);
     std::atomic_ref(sums.pixels[index]).fetch_add(pixels, std::memory_order_relaxed);
@@ -318,7 +298,6 @@ struct ContributionSink {
   }
 };
 
-// Composites one tile without colours and adds the contributions of its splats to `sums` (importance.h).
 template <class Lanes>
 void contribute_tile(const TileJob<typename Lanes::Scalar>& tile, const ContributionSums& sums) {
   using T = typename Lanes::Scalar;
@@ -327,37 +306,33 @@ void contribute_tile(const TileJob<typename Lanes::Scalar>& tile, const Contribu
   composite_list<Lanes>(tile, state, sink);
 }
 
-// Writes the splats of the pixels (rasterize.h).
-template <class Lanes, class T>
-struct PixelSink {
+template <class Lanes, class T> struct PixelSink {
   const TileJob<T>& tile;
   const ForwardState<T>& state;
   const PixelSplats<T>& out;
-  std::int32_t id = 0;
+  int32_t id = 0;
 
-  void begin(std::int32_t index) { id = index; }
+  void begin(int32_t index) { id = index; }
   void add(Lanes share, int pixel) const {
     alignas(64) T shares[kLanes];
     share.store(shares);
     const int y = pixel / state.layout.stride, x = pixel % state.layout.stride;
     for (int i = 0; i < kLanes; ++i) {
       if (!(shares[i] > T(0))) continue;
-      const std::int64_t row =
-          row_of(out, tile.first_pixel + static_cast<std::int64_t>(y) * tile.image_width + x + i);
+      const int64_t row = row_of(out, tile.first_pixel + int64_t(y) * tile.image_width + x + i);
       if (row < 0) continue;
       // The transmittance is still that in front of the splat.
       if (state.transmittance[pixel + i] > T(kMedianTransmittance)) out.medians[row] = id;
-      const std::int32_t count = out.counts[row]++;
+      const int32_t count = out.counts[row]++;
       if (out.strongest > 0) {
-        const std::int64_t first = row * out.strongest;
+        const int64_t first = row * out.strongest;
         keep_strongest(out.ids + first, out.weights + first, out.strongest, count, id, shares[i]);
       }
     }
   }
-  void end(std::int32_t) const {}
+  void end(int32_t) const {}
 };
 
-// Composites one tile without colours and writes the splats of its pixels.
 template <class Lanes>
 void list_tile_splats(const TileJob<typename Lanes::Scalar>& tile,
                       const PixelSplats<typename Lanes::Scalar>& out) {
@@ -366,22 +341,21 @@ void list_tile_splats(const TileJob<typename Lanes::Scalar>& tile,
   const auto for_rows = [&](auto&& write) {
     for (int y = 0; y < tile.height; ++y) {
       for (int x = 0; x < tile.width; ++x) {
-        const std::int64_t row =
-            row_of(out, tile.first_pixel + static_cast<std::int64_t>(y) * tile.image_width + x);
+        const int64_t row = row_of(out, tile.first_pixel + int64_t(y) * tile.image_width + x);
         if (row >= 0) write(row, y * state.layout.stride + x);
       }
     }
   };
-  for_rows([&](std::int64_t row, int) {
+  for_rows([&](int64_t row, int) {
     out.counts[row] = 0;
     out.medians[row] = -1;
   });
   PixelSink<Lanes, T> sink{tile, state, out};
   composite_list<Lanes>(tile, state, sink);
-  for_rows([&](std::int64_t row, int pixel) {
+  for_rows([&](int64_t row, int pixel) {
     const T running = state.transmittance[pixel];
     out.transmittances[row] = running > T(0) ? running : state.ended[pixel];
-    for (std::int64_t k = out.counts[row]; k < out.strongest; ++k) {
+    for (int64_t k = out.counts[row]; k < out.strongest; ++k) {
       out.ids[row * out.strongest + k] = -1;
       out.weights[row * out.strongest + k] = T(0);
     }

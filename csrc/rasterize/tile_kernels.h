@@ -1,16 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 // The CPU kernels of one tile, forward (tile_forward.h) and backward, over the lane types of math/lanes.h.
-// They are compiled twice, plain and with AVX2; everything here has internal linkage, so that the linker
-// cannot mix the two.
+// They are compiled twice, plain and with AVX2; internal linkage keeps the two apart.
 //
 // A kernel takes the splats of the list one after the other, forward front to back, backward back to front.
 // For each splat it visits the pixel rows that the splat's ellipse meets, and in a row eight pixels at a time
 // from the first pixel inside the ellipse. The state of the pixels is in scratch planes that fit the
 // first-level cache. Rows are padded so that eight pixels can be loaded from any pixel of the row.
 #pragma once
-#include <algorithm>
-#include <bit>
-#include <cstdint>
 #include <vector>
 
 #include "rasterize/tile_forward.h"
@@ -18,29 +14,26 @@
 namespace blitzgs::cpu {
 namespace {
 
-template <class T>
-struct BackwardState {
+template <class T> struct BackwardState {
   PlaneLayout layout;
   T* transmittance;  // in front of the entries visited so far
   T* behind;         // v_renders . (the colour of those entries and the background, as seen with T = 1)
   T *v_render, *centres;
-  std::int32_t* last;
-  std::int32_t last_in_row[kMaxTileSize] = {};
+  int32_t* last;
+  int32_t last_in_row[kMaxTileSize] = {};
 };
 
-template <int D, class T>
-BackwardState<T> start_backward(const TileJob<T>& tile) {
+template <int D, class T> BackwardState<T> start_backward(const TileJob<T>& tile) {
   const int n_channels = channels<D>(tile);
   auto state = start_planes<BackwardState<T>>(tile, n_channels);
   for (int row = 0; row < tile.height; ++row) {
     for (int x = 0; x < tile.width; ++x) {
       const int pixel = row * state.layout.stride + x;
-      const std::int64_t in = tile.first_pixel + static_cast<std::int64_t>(row) * tile.image_width + x;
+      const int64_t in = tile.first_pixel + int64_t(row) * tile.image_width + x;
       state.transmittance[pixel] = tile.saved.transmittances[in];
       state.last[pixel] = tile.saved.last_ids[in];
       state.last_in_row[row] = std::max(state.last_in_row[row], state.last[pixel]);
-      // The gradient of a pixel without splats reaches none, also if it is NaN, as that of 1 / depth is
-      // there.
+      // The gradient of a pixel without splats reaches none, also if it is NaN, as of 1 / depth.
       if (state.last[pixel] == 0) continue;
       T behind = tile.saved.v_alphas ? -tile.saved.v_alphas[in] : T(0);
       for (int c = 0; c < n_channels; ++c) {
@@ -55,8 +48,7 @@ BackwardState<T> start_backward(const TileJob<T>& tile) {
 }
 
 // The sums over the pixels of one splat in one tile, one partial sum per lane; g = alpha dL/dalpha.
-template <class Lanes, bool kAbs>
-struct GradientSums {
+template <class Lanes, bool kAbs> struct GradientSums {
   Lanes g = Lanes::zero(), gu = Lanes::zero(), gy = Lanes::zero();
   Lanes gxx = Lanes::zero(), gxy = Lanes::zero(), gyy = Lanes::zero();
   Lanes abs_x = Lanes::zero(), abs_y = Lanes::zero();
@@ -65,8 +57,8 @@ struct GradientSums {
 // Differentiates one entry at eight pixels of a row: adds to its sums and v_color, and updates the pixels.
 template <class Lanes, int D, bool kAbs, class T>
 inline void differentiate(const TileJob<T>& tile, const PreparedSplat<T>& splat, const T* splat_colors,
-                          const RowSpans<T>& spans, std::int32_t entry, int row, int x,
-                          BackwardState<T>& state, GradientSums<Lanes, kAbs>& sums, Lanes* v_color) {
+                          const RowSpans<T>& spans, int32_t entry, int row, int x, BackwardState<T>& state,
+                          GradientSums<Lanes, kAbs>& sums, Lanes* v_color) {
   const int pixel = row * state.layout.stride + x;
   const auto composited =
       Lanes::Int::greater(Lanes::Int::load(state.last + pixel), Lanes::Int::broadcast(entry));
@@ -136,7 +128,7 @@ void backward_tile(const TileJob<typename Lanes::Scalar>& tile, typename Lanes::
   RowSpans<T> spans;
   const int n_channels = channels<D>(tile), width = partial_width(n_channels, kAbs);
   std::vector<Lanes> many(D > 0 ? 0 : n_channels);
-  for (std::int32_t entry = tile.n_entries - 1; entry >= 0; --entry) {
+  for (int32_t entry = tile.n_entries - 1; entry >= 0; --entry) {
     __builtin_prefetch(tile.splats + tile.list[std::max(entry - kPrefetchDistance, 0)]);
     const PreparedSplat<T>& splat = tile.splats[tile.list[entry]];
     const T* color = splat_color<D>(tile, tile.list[entry]);
@@ -144,7 +136,7 @@ void backward_tile(const TileJob<typename Lanes::Scalar>& tile, typename Lanes::
     Lanes few[D > 0 ? D : 1];
     Lanes* v_color = D > 0 ? few : many.data();
     std::fill_n(v_color, n_channels, Lanes::zero());
-    std::uint64_t rows = find_spans<Lanes>(splat, tile, spans);
+    uint64_t rows = find_spans<Lanes>(splat, tile, spans);
     for (; rows; rows &= rows - 1) {
       const int row = std::countr_zero(rows);
       if (state.last_in_row[row] <= entry) continue;
@@ -152,19 +144,17 @@ void backward_tile(const TileJob<typename Lanes::Scalar>& tile, typename Lanes::
         differentiate<Lanes, D, kAbs>(tile, splat, color, spans, entry, row, x, state, sums, v_color);
       }
     }
-    write_partial(splat, sums, v_color, n_channels, partials + static_cast<std::int64_t>(entry) * width);
+    write_partial(splat, sums, v_color, n_channels, partials + int64_t(entry) * width);
   }
 }
 
 // D: the number of channels; 0: any.
-template <class Lanes, int D>
-TileKernels<typename Lanes::Scalar> kernels_of(bool absgrad) {
+template <class Lanes, int D> TileKernels<typename Lanes::Scalar> kernels_of(bool absgrad) {
   return {forward_tile<Lanes, D>, absgrad ? backward_tile<Lanes, D, true> : backward_tile<Lanes, D, false>,
           contribute_tile<Lanes>, list_tile_splats<Lanes>};
 }
 
-template <class Lanes>
-TileKernels<typename Lanes::Scalar> select_kernels(int n_channels, bool absgrad) {
+template <class Lanes> TileKernels<typename Lanes::Scalar> select_kernels(int n_channels, bool absgrad) {
   const auto kernels = n_channels == 3   ? kernels_of<Lanes, 3>
                        : n_channels == 4 ? kernels_of<Lanes, 4>
                                          : kernels_of<Lanes, 0>;

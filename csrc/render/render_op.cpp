@@ -1,21 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "render/render.h"
 
-#include <functional>
 #include <numeric>
-#include <tuple>
 
 #include "project/project_op.h"
 #include "rasterize/rasterize_op.h"
 
 namespace blitzgs {
-// Colours, tile lists, compositing and alphas in one op, because each call of an op takes the host
-// microseconds.
+// Colours, tile lists, compositing and alphas in one op, because each takes the host microseconds.
 namespace {
 
 // Words of 4 bytes in the elements of a row behind its first `axis` dimensions.
-std::int64_t words_behind(const Tensor& column, std::int64_t axis) {
-  return static_cast<std::int64_t>(column.element_size()) / 4 * elements_behind(column, axis);
+int64_t words_behind(const Tensor& column, int64_t axis) {
+  return int64_t(column.element_size()) / 4 * elements_behind(column, axis);
 }
 
 void check_column(const Tensor& column) {
@@ -26,35 +23,35 @@ void check_column(const Tensor& column) {
                 shape_of(column));
 }
 
-IntList shape_with(const Tensor& column, std::int64_t rows) {
+IntList shape_with(const Tensor& column, int64_t rows) {
   IntList shape{rows};
-  for (std::int64_t axis = 1; axis < column.dim(); ++axis) shape.push_back(column.size(axis));
+  for (int64_t axis = 1; axis < column.dim(); ++axis) shape.push_back(column.size(axis));
   return shape;
 }
 
 // The rows `ids` of `columns`, and then of `joined`, side by side along their second dimension. ids: int32
 // [n], contiguous; known: as in GatherRows.
 TensorList gathered_rows(const TensorList& columns, const TensorList& joined, const Tensor& ids,
-                         const std::int64_t* known) {
+                         const int64_t* known) {
   BLITZGS_CHECK(columns.size() + joined.size() <= kMaxGatheredColumns, "at most ", kMaxGatheredColumns,
                 " columns, got ", columns.size() + joined.size());
-  const std::int64_t n = ids.size(0);
-  GatherRows gather{data<std::int32_t>(ids), n, known, 0, {}};
+  const int64_t n = ids.size(0);
+  GatherRows gather{data<int32_t>(ids), n, known, 0, {}};
   TensorList held, found;
-  const auto add = [&](const Tensor& column, std::uint32_t* to, std::int64_t stride) {
+  const auto add = [&](const Tensor& column, uint32_t* to, int64_t stride) {
     const Tensor& from = held.emplace_back(as_contiguous(column));
-    const auto width = static_cast<std::uint32_t>(words_behind(from, 1));
-    gather.columns[gather.n_columns++] = {static_cast<const std::uint32_t*>(from.const_data_ptr()), to,
-                                          stride, width};
+    const auto width = uint32_t(words_behind(from, 1));
+    gather.columns[gather.n_columns++] = {static_cast<const uint32_t*>(from.const_data_ptr()), to, stride,
+                                          width};
     return width;
   };
   for (const Tensor& column : columns) {
     check_column(column);
     Tensor& rows = found.emplace_back(make_empty(column, shape_with(column, n)));
-    add(column, static_cast<std::uint32_t*>(rows.mutable_data_ptr()), words_behind(column, 1));
+    add(column, static_cast<uint32_t*>(rows.mutable_data_ptr()), words_behind(column, 1));
   }
   if (!joined.empty()) {
-    std::int64_t length = 0, stride = 0;
+    int64_t length = 0, stride = 0;
     for (const Tensor& part : joined) {
       check_column(part);
       check_dtype("joined columns", part, joined[0].scalar_type());
@@ -68,7 +65,7 @@ TensorList gathered_rows(const TensorList& columns, const TensorList& joined, co
     IntList shape = shape_with(joined[0], n);
     shape[1] = length;
     Tensor& rows = found.emplace_back(make_empty(joined[0], shape));
-    auto* to = static_cast<std::uint32_t*>(rows.mutable_data_ptr());
+    auto* to = static_cast<uint32_t*>(rows.mutable_data_ptr());
     for (const Tensor& part : joined) to += add(part, to, stride);
   }
   DeviceScope scope(ids);
@@ -80,25 +77,25 @@ TensorList first_rows(const TensorList& columns, const IntList& lengths) {
   BLITZGS_CHECK(columns.size() == lengths.size(), columns.size(), " columns need a length each, got ",
                 lengths.size());
   TensorList found;
-  for (std::size_t c = 0; c < columns.size(); ++c) {
+  for (size_t c = 0; c < columns.size(); ++c) {
     BLITZGS_CHECK(columns[c].dim() >= 1 && lengths[c] >= 0,
                   "columns must have rows, and lengths be at least 0, got ", shape_of(columns[c]), " and ",
                   lengths[c]);
     IntList shape = shape_with(columns[c], std::min(columns[c].size(0), lengths[c])), strides;
-    for (std::int64_t axis = 0; axis < columns[c].dim(); ++axis) strides.push_back(columns[c].stride(axis));
+    for (int64_t axis = 0; axis < columns[c].dim(); ++axis) strides.push_back(columns[c].stride(axis));
     found.push_back(view_of(columns[c], shape, strides, 0));
   }
   return found;
 }
 
 // The totals of the projection; null: the splats have no spare capacity.
-const std::int64_t* checked_totals(const OptionalTensor& totals) {
+const int64_t* checked_totals(const OptionalTensor& totals) {
   if (!totals) return nullptr;
   check_in_place("totals", *totals, ScalarType::Long, {-1});
   BLITZGS_CHECK(totals->size(0) > kTotalSplats, "totals must be those of project_fwd, got ",
                 shape_of(*totals));
   BLITZGS_CHECK(kOnCuda, "on the CPU splats have no spare capacity, so give no totals");
-  return data<std::int64_t>(*totals);
+  return data<int64_t>(*totals);
 }
 
 // The columns of splats that their colours are computed from, and those that hide a splat.
@@ -109,25 +106,25 @@ struct ColoredSplats {
 // The visible rows of the Gaussians and the colours of their splats: colors, numbers, indices, rows.
 TensorList color_rows(const TensorList& gaussians, const TensorList& sh, const Tensor& viewmats,
                       const Tensor& Ks, const ProjectOptions<double>& options, const ColoredSplats& splats,
-                      const std::int64_t* totals) {
+                      const int64_t* totals) {
   check_group("gaussians (means, quats, scales, opacities)", gaussians, 4, 4);
   check_floating("means", gaussians[0]);
-  const std::int64_t U = splats.visible_ids.numel(), P = splats.camera_ids.numel();
-  const auto visible_ids = checked_in_place<std::int32_t>("visible_ids", splats.visible_ids, {U}),
-             offsets = checked_in_place<std::int32_t>("splat_offsets", splats.splat_offsets, {U + 1}),
-             camera_ids = checked_in_place<std::int32_t>("camera_ids", splats.camera_ids, {P}),
-             radii = checked_in_place<std::int32_t>("radii", splats.radii, {P, 2}),
-             tiles = checked_in_place<std::int32_t>("tiles_touched", splats.tiles_touched, {P});
+  const int64_t U = splats.visible_ids.numel(), P = splats.camera_ids.numel();
+  const auto visible_ids = checked_in_place<int32_t>("visible_ids", splats.visible_ids, {U}),
+             offsets = checked_in_place<int32_t>("splat_offsets", splats.splat_offsets, {U + 1}),
+             camera_ids = checked_in_place<int32_t>("camera_ids", splats.camera_ids, {P}),
+             radii = checked_in_place<int32_t>("radii", splats.radii, {P, 2}),
+             tiles = checked_in_place<int32_t>("tiles_touched", splats.tiles_touched, {P});
   check_in_place("splat_opacities", splats.opacities, gaussians[0].scalar_type(), {P});
   const ProjectCapacity capacity{{U, P}, totals};
   TensorList found =
       gathered_rows(gaussians, sh, splats.visible_ids, totals ? totals + kTotalVisible : nullptr);
   const ProjectArguments p(found, viewmats, Ks, options);
-  const auto numbers = make<std::int32_t>(visible_ids, {U});
-  const auto indices = make<std::int64_t>(visible_ids, {U});
+  const auto numbers = make<int32_t>(visible_ids, {U});
+  const auto indices = make<int64_t>(visible_ids, {U});
   const Tensor colors = make_empty(p.means, {p.sh ? P : 0, 3});
   DeviceScope scope(p.means);
-  auto* row_of_splat = scope.workspace.allocate<std::int32_t>(P);
+  auto* row_of_splat = scope.workspace.allocate<int32_t>(P);
   backend::for_each_row(NumberedRows{capacity, visible_ids, offsets, numbers, indices, row_of_splat, U},
                         scope.stream);
   if (p.sh) {
@@ -150,7 +147,7 @@ TensorList color_rows(const TensorList& gaussians, const TensorList& sh, const T
 Tensor joined(const Tensor& colors, const Tensor& depths) {
   std::array<StableIValue, 2> stack{
       torch::stable::detail::from(TensorList{colors, torch::stable::unsqueeze(depths, 1)}),
-      torch::stable::detail::from(std::int64_t{1})};
+      torch::stable::detail::from(int64_t{1})};
   TORCH_ERROR_CODE_CHECK(torch_call_dispatcher("aten::cat", "", stack.data(), TORCH_ABI_VERSION));
   return torch::stable::detail::to<Tensor>(stack[0]);
 }
@@ -160,9 +157,9 @@ TensorList render(const Tensor& means2d, const Tensor& conics, const Tensor& spl
                   const Tensor& splat_offsets, const Tensor& radii, const Tensor& tiles_touched,
                   const OptionalTensor& channels_in, bool with_depth, const TensorList& gaussians,
                   const TensorList& sh, const Tensor& viewmats, const Tensor& Ks, BLITZGS_PROJECT_OPTIONS,
-                  const FloatList& fade, const OptionalTensor& backgrounds, std::int64_t n_isects,
+                  const FloatList& fade, const OptionalTensor& backgrounds, int64_t n_isects,
                   bool backward_follows, const OptionalTensor& totals_in) {
-  const std::int64_t* totals = checked_totals(totals_in);
+  const int64_t* totals = checked_totals(totals_in);
   OptionalTensor n_splats;
   if (totals) n_splats = view_of(*totals_in, {1}, {1}, kTotalSplats);
   TensorList rows;
@@ -174,7 +171,7 @@ TensorList render(const Tensor& means2d, const Tensor& conics, const Tensor& spl
   }
   BLITZGS_CHECK(channels_in || !sh.empty(), "splats without sh need channels");
   const Tensor channels = channels_in ? *channels_in : with_depth ? joined(rows[0], depths) : rows[0];
-  const std::int64_t views = viewmats.size(0);
+  const int64_t views = viewmats.size(0);
   const auto lists = intersect(means2d, conics, splat_opacities, depths, camera_ids, std::nullopt, views,
                                width, height, tile_size, 0, -1, n_isects, n_splats, /*unchecked=*/true);
   const auto outputs = rasterize_fwd(means2d, conics, splat_opacities, channels, backgrounds,
@@ -212,21 +209,21 @@ struct Places {
     moves.count = shape.back();
     BLITZGS_CHECK(!ordered || entries() == moves.n, "an arrangement of ", entries(),
                   " entries cannot be an order of ", moves.n, " splats");
-    moves.order = ordered ? data<std::int64_t>(index[0]) : nullptr;
-    moves.images = ordered ? nullptr : data<std::int32_t>(index[0]);
-    moves.gaussians = ordered ? nullptr : data<std::int32_t>(index[1]);
+    moves.order = ordered ? data<int64_t>(index[0]) : nullptr;
+    moves.images = ordered ? nullptr : data<int32_t>(index[0]);
+    moves.gaussians = ordered ? nullptr : data<int32_t>(index[1]);
   }
 
-  std::int64_t entries() const {
-    return std::accumulate(shape.begin(), shape.end(), std::int64_t{1}, std::multiplies<>());
+  int64_t entries() const {
+    return std::accumulate(shape.begin(), shape.end(), int64_t{1}, std::multiplies<>());
   }
   bool has_empty_entries() const { return moves.order == nullptr; }
 };
 
 // Whether the elements of each row follow one another.
-bool rows_are_contiguous(const Tensor& column, std::int64_t row_axis) {
-  std::int64_t expected = 1;
-  for (std::int64_t axis = column.dim() - 1; axis >= row_axis; --axis) {
+bool rows_are_contiguous(const Tensor& column, int64_t row_axis) {
+  int64_t expected = 1;
+  for (int64_t axis = column.dim() - 1; axis >= row_axis; --axis) {
     if (column.size(axis) != 1 && column.stride(axis) != expected) return false;
     expected *= column.size(axis);
   }
@@ -235,7 +232,7 @@ bool rows_are_contiguous(const Tensor& column, std::int64_t row_axis) {
 
 // Allocates the targets of columns whose rows are indexed by the first `from` dimensions, with the dimensions
 // `to` in place of these, and lists both in `moves`. `held` keeps the sources alive.
-TensorList make_targets(const TensorList& columns, std::size_t from, const IntList& to, TensorList& held,
+TensorList make_targets(const TensorList& columns, size_t from, const IntList& to, TensorList& held,
                         ArrangeSplats& moves) {
   BLITZGS_CHECK(columns.size() <= kMaxArranged, "at most ", kMaxArranged, " columns, got ", columns.size());
   TensorList targets;
@@ -246,14 +243,12 @@ TensorList make_targets(const TensorList& columns, std::size_t from, const IntLi
     BLITZGS_CHECK(column.element_size() % 4 == 0, "columns must have elements of 4 or 8 bytes, got ",
                   torch::headeronly::toString(column.scalar_type()));
     IntList shape = to;
-    for (auto axis = static_cast<std::int64_t>(from); axis < column.dim(); ++axis) {
-      shape.push_back(column.size(axis));
-    }
-    const std::int64_t words = words_behind(column, static_cast<std::int64_t>(from));
+    for (auto axis = int64_t(from); axis < column.dim(); ++axis) shape.push_back(column.size(axis));
+    const int64_t words = words_behind(column, int64_t(from));
     targets.push_back(make_empty(column, shape));
     moves.columns[moves.n_columns++] = {
-        static_cast<const std::uint32_t*>(held.back().const_data_ptr()),
-        static_cast<std::uint32_t*>(targets.back().mutable_data_ptr()), words,
+        static_cast<const uint32_t*>(held.back().const_data_ptr()),
+        static_cast<uint32_t*>(targets.back().mutable_data_ptr()), words,
         strided ? column.stride(0) * words_behind(column, column.dim()) : words};
   }
   return targets;
@@ -270,21 +265,21 @@ TensorList arrange_splats(const TensorList& columns, const TensorList& places_in
   }
   TensorList arranged = make_targets(columns, 1, shape, held, places.moves);
   OptionalTensor below;
-  const std::int64_t views = places.has_empty_entries() ? shape[shape.size() - 2] : 1;
+  const int64_t views = places.has_empty_entries() ? shape[shape.size() - 2] : 1;
   if (under) {
     const Tensor& last = columns.back();
     BLITZGS_CHECK(places.has_empty_entries() && last.dim() == 1,
                   "`under` is for a last column of numbers and an arrangement of all Gaussians");
     check_dtype("under", *under, last.scalar_type());
     BLITZGS_CHECK(under->numel() * views == places.entries(), "under must have ",
-                  places.entries() / std::max<std::int64_t>(views, 1), " values, got ", shape_of(*under));
+                  places.entries() / std::max<int64_t>(views, 1), " values, got ", shape_of(*under));
     below = as_contiguous(*under);
   }
   DeviceScope scope(columns[0]);
   for (int c = 0; places.has_empty_entries() && c < places.moves.n_columns; ++c) {
     const auto& [from, to, words, stride] = places.moves.columns[c];
     if (below && c == places.moves.n_columns - 1) {
-      const auto* values = static_cast<const std::uint32_t*>(below->const_data_ptr());
+      const auto* values = static_cast<const uint32_t*>(below->const_data_ptr());
       backend::for_each_row(UnderSplats{values, to, places.entries(), words, places.moves.count, views},
                             scope.stream);
     } else {
@@ -300,9 +295,9 @@ TensorList splats_of_arranged(const TensorList& arranged, const TensorList& plac
   TensorList held;
   if (arranged.empty()) return {};
   for (const Tensor& column : arranged) {
-    bool fits = column.dim() >= static_cast<std::int64_t>(shape.size());
-    for (std::size_t axis = 0; fits && axis < shape.size(); ++axis) {
-      fits = column.size(static_cast<std::int64_t>(axis)) == shape[axis];
+    bool fits = column.dim() >= int64_t(shape.size());
+    for (size_t axis = 0; fits && axis < shape.size(); ++axis) {
+      fits = column.size(int64_t(axis)) == shape[axis];
     }
     BLITZGS_CHECK(fits, "columns must begin with the dimensions of the arrangement, got ", shape_of(column));
   }

@@ -1,14 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // Runs the readers of files that other programs write under libFuzzer (`make fuzz`). There is one program for
 // each target, which the build names in BLITZGS_FUZZ. A reader must either succeed or throw FormatError. The
-// sanitizers stop the program if it reads beyond the input, and libFuzzer stops it if it hangs or allocates
-// too much.
+// sanitizers stop the program if it reads beyond the input, libFuzzer if it hangs or allocates too much.
 #include <cstddef>
-#include <cstdint>
-#include <span>
-#include <sstream>
-#include <string>
-#include <vector>
 
 #include "io/colmap.h"
 #include "io/image_file.h"
@@ -18,7 +12,7 @@ namespace io = blitzgs::io;
 
 namespace {
 
-using Input = std::span<const std::uint8_t>;
+using Input = std::span<const uint8_t>;
 
 std::istringstream stream_of(Input input) {
   return std::istringstream(std::string(input.begin(), input.end()));
@@ -28,13 +22,13 @@ std::istringstream stream_of(Input input) {
 
 [[maybe_unused]] void qoi(Input input) {
   const io::QoiSize size = io::qoi_size(input);
-  const std::uint64_t bytes = 3ull * size.width * size.height;
+  const uint64_t bytes = 3ull * size.width * size.height;
   if (bytes > (64u << 20)) return;  // limits the memory: a small file may have many pixels
-  std::vector<std::uint8_t> pixels(bytes);
+  std::vector<uint8_t> pixels(bytes);
   io::decode_qoi(input, pixels.data());
   // An image that was read must be the same after it was written and read again.
-  const std::vector<std::uint8_t> again = io::encode_qoi(pixels.data(), size);
-  std::vector<std::uint8_t> second(bytes);
+  const std::vector<uint8_t> again = io::encode_qoi(pixels.data(), size);
+  std::vector<uint8_t> second(bytes);
   io::decode_qoi(again, second.data());
   if (second != pixels) __builtin_trap();
 }
@@ -44,7 +38,7 @@ std::istringstream stream_of(Input input) {
   if (header.orientation < 1 || header.orientation > 8) __builtin_trap();
   io::check_image(input, "f");
   if (header.format != "TIFF") return;
-  const std::vector<std::uint8_t> stored = io::tiff_as_stored(input, "f");
+  const std::vector<uint8_t> stored = io::tiff_as_stored(input, "f");
   if (!stored.empty() && stored.size() != input.size()) __builtin_trap();
 }
 
@@ -59,7 +53,7 @@ template <class Cameras, class Images, class Points>
 void colmap(Input input, Cameras cameras, Images images, Points points) {
   if (input.empty()) return;
   std::istringstream in = stream_of(input.subspan(1));
-  const std::uint8_t choice = input[0];
+  const uint8_t choice = input[0];
   if (choice % 3 == 0) {
     for (const io::ColmapCamera& camera : cameras(in, "f")) {
       if (!io::find_camera_model(camera.model)) __builtin_trap();
@@ -84,7 +78,7 @@ void colmap(Input input, Cameras cameras, Images images, Points points) {
 
 }  // namespace
 
-extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
+extern "C" int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
   try {
     BLITZGS_FUZZ(Input(data, size));
   } catch (const io::FormatError&) {
