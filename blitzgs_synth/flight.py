@@ -31,8 +31,7 @@ class View:
     @property
     def translation(self) -> Doubles:
         """Return t = -R c, [3]."""
-        moved: Doubles = -self.rotation @ self.centre
-        return moved
+        return -self.rotation @ self.centre
 
     def project(self, points: Doubles) -> tuple[Doubles, Doubles]:
         """Return pixels [N, 2] and depths [N] of world points [N, 3]; pixels mean nothing at depth <= 0."""

@@ -25,6 +25,10 @@ from blitzgs_synth.plan import (
 
 _SWAY: Final = 0.12  # standard deviation of the movement of crops, metres
 _WHITE: Final = (0.74, 0.74, 0.70)
+# Red, green and blue of five crops.
+_CROPS: Final = np.array([
+    [0.13, 0.27, 0.19, 0.15, 0.30], [0.18, 0.235, 0.14, 0.195, 0.28], [0.06, 0.12, 0.09, 0.075, 0.16],
+], np.float32)  # fmt: skip
 
 
 def ground_color(plan: Plan, noise: Noise, position: Floats, footprint: Floats, centre: Doubles) -> Floats:
@@ -74,8 +78,7 @@ def ground_color(plan: Plan, noise: Noise, position: Floats, footprint: Floats, 
 def _asphalt(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
     tone = noise.layers(x, y, footprint, (11.0, 0.09), (2.3, 0.07), (0.5, 0.07), (0.2, 0.06))
     repair = (cell_random(np.floor(x / 7), np.floor(y / 5), 3) > 0.88) * np.float32(-0.22)
-    color: Floats = rgb(0.155, 0.155, 0.16) * (1 + tone + repair)
-    return color
+    return rgb(0.155, 0.155, 0.16) * (1 + tone + repair)
 
 
 def _line(offset: Floats, width: float, footprint: Floats) -> Floats:
@@ -225,17 +228,7 @@ def _fields(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
     row = np.floor(v / 62 + 0.15 * noise(u / 300, v / 300))
     column = np.floor(u / 95 + cell_random(row, row, 31))
     crop = cell_random(column, row, 37)
-    palette = np.array(
-        [
-            [0.13, 0.18, 0.06],
-            [0.27, 0.235, 0.12],
-            [0.19, 0.14, 0.09],
-            [0.15, 0.195, 0.075],
-            [0.30, 0.28, 0.16],
-        ],
-        np.float32,
-    )
-    color: Floats = palette.T.take(np.minimum((crop * 5).astype(np.int64), 4), axis=1)
+    color: Floats = _CROPS.take(np.minimum((crop * 5).astype(np.int64), 4), axis=1)
     turned = cell_random(column, row, 41) > 0.5
     furrows = (stripes(np.where(turned, u, v), 2.6, 0.0, 0.5, footprint) - 0.5) * 0.22
     tone = noise.layers(x, y, footprint, (40.0, 0.08), (9.0, 0.09), (2.0, 0.09), (0.6, 0.10))

@@ -48,8 +48,7 @@ class Noise:
             periods *= np.float32(_LATTICE * _TEXELS)
         u, v = maps.reshape(2, rows, _ROW)
         sampled = cv2.remap(self._texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        values: Floats = sampled.reshape(-1)[:count]
-        return values
+        return sampled.reshape(-1)[:count]
 
     def layers(self, x: Floats, y: Floats, footprint: Floats, *bands: tuple[float, float]) -> Floats:
         """Return a sum of bands (wavelength in metres, amplitude), each faded out where it is unresolved."""
@@ -90,8 +89,7 @@ def stripes(
 
     def integral(t: Floats) -> Floats:
         whole = np.floor(t)
-        filled: Floats = whole * (high - low) + np.clip(t - whole - low, 0, high - low)
-        return filled
+        return whole * (high - low) + np.clip(t - whole - low, 0, high - low)
 
     covered: Floats = (integral(scaled + half) - integral(scaled - half)) / (2 * half)
     return covered.astype(np.float32)
@@ -254,8 +252,7 @@ def plain(p: Points, noise: Noise) -> Floats:
     """Return concrete, plaster, painted boards: the colour with weathering."""
     x = p.u + p.position[0] + p.numbers[0]
     tone = noise.layers(x, p.v + p.position[1], p.footprint, (3.0, 0.07), (0.7, 0.07), (0.25, 0.05))
-    weathered: Floats = p.color * (1 + tone)
-    return weathered
+    return p.color * (1 + tone)
 
 
 def solar(p: Points, noise: Noise) -> Floats:

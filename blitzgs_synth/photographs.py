@@ -113,8 +113,7 @@ def _exposed(image: Bytes, index: int, options: CityOptions) -> Bytes:
     gains = np.exp(options.exposure * (rng.standard_normal() + 0.25 * rng.standard_normal(3)))
     values = image.astype(np.float32) * gains.astype(np.float32)
     values += np.float32(options.grain) * rng.standard_normal(image.shape, np.float32)
-    exposed: Bytes = np.clip(values + 0.5, 0, 255).astype(np.uint8)
-    return exposed
+    return np.clip(values + 0.5, 0, 255).astype(np.uint8)
 
 
 def _finished(image: Path, record: Path) -> Corners | None:

@@ -24,8 +24,7 @@ Bytes = NDArray[np.uint8]
 
 def dot(a: Floats, b: Floats) -> Floats:
     """Return the inner products [R] of columns [3, R], or of one vector [3] with each column."""
-    product: Floats = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-    return product
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def transformed(matrix: Floats, columns: Floats) -> Floats:

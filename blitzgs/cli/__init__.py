@@ -54,10 +54,7 @@ COMMANDS = {
     "gate": ("blitzgs.cli.gate", "fit and evaluate spawn gates, which make smaller models"),
     "doctor": ("blitzgs.cli.doctor", "check this installation"),
     "completion": ("blitzgs.cli.completion", "print a script that completes commands in a shell"),
-    "synth": (
-        "blitzgs.cli.arguments:add_synth",
-        "make a synthetic city: photographs, cameras and points to train on",
-    ),
+    "synth": ("blitzgs_synth.generate", "make a synthetic city: photographs, cameras and points to train on"),
 }
 
 

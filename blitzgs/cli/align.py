@@ -20,7 +20,7 @@ from blitzgs.capture.world import (
     gps_positions,
     reference_system,
 )
-from blitzgs.cli.arguments import Commands, add_capture, add_command, add_flags, add_run
+from blitzgs.cli.arguments import DATA, RUN, Commands, add_arguments, add_command
 from blitzgs.config.files import load_config
 from blitzgs.runs import run_files
 from blitzgs.runs.world import load_world_frame, save_world_frame
@@ -52,12 +52,9 @@ GIVEN = """
 
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "align", run, summary, HELP)
-    add_run(parser)
-    how = parser.add_mutually_exclusive_group()
-    add_flags(how, GIVEN)
-    add_flags(parser, "--crs EPSG:N  reference system of the points, or wanted")
-    add_capture(parser)
+    text = f"{RUN}{DATA}--crs EPSG:N  reference system of the points, or wanted"
+    parser = add_command(commands, "align", run, summary, HELP, text)
+    add_arguments(parser.add_mutually_exclusive_group(), GIVEN)
 
 
 def run(args: argparse.Namespace) -> None:

@@ -42,8 +42,7 @@ complete -o default -F _blitzgs blitzgs
 
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "completion", run, summary, HELP)
-    parser.add_argument("shell", metavar="SHELL", choices=("bash", "zsh", "fish"))
+    add_command(commands, "completion", run, summary, HELP, "shell bash|zsh|fish  the shell")
 
 
 def run(args: argparse.Namespace) -> None:

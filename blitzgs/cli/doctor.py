@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from blitzgs import __version__
-from blitzgs.cli.arguments import Commands, add_command, add_flags
+from blitzgs.cli.arguments import Commands, add_command
 from blitzgs.cli.doctor_probes import REINSTALL, REPORT, found
 
 HELP = """\
@@ -41,7 +41,7 @@ and says what mends it. The exit status is 1 if something that BlitzGS cannot do
 Put the output of --json into reports of faults.
 """
 
-FLAGS = """
+ARGUMENTS = """
 --json  print the report as JSON
 --folder DIR  measure the disk of this folder too, with a file of 64 MB that is removed
 """
@@ -71,8 +71,7 @@ class ProbeError(Exception):
 
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "doctor", run, summary, HELP)
-    add_flags(parser, FLAGS)
+    add_command(commands, "doctor", run, summary, HELP, ARGUMENTS)
 
 
 def run(args: argparse.Namespace) -> int:

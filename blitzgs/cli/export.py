@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from blitzgs.cli import arguments
+from blitzgs.cli.arguments import DATA, DEVICE, MODEL, Commands, Types, add_arguments, add_command, number
 from blitzgs.cli.view import photographs
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import GaussianSource, check_memory, is_antialiased
@@ -81,19 +81,24 @@ A city that no browser holds at once is written as a folder that viewers load pi
 Memory does not grow with a run or a PLY file; the disk needs two and a half times the size of the model.
 See docs/guide/formats.md.
 """
-FOLDERS = """
+KINDS = "\n".join(f"--{name} FILE  {found.title} file to write" for name, found in FORMATS.items())
+KINDS += """
 --html FILE  HTML file to write
 --tiles DIR  folder to make for 3D Tiles (tileset.json)
 --streamed-sog DIR  folder to make for streamed SOG (lod-meta.json)
 """
-FLAGS = f"""
+ARGUMENTS = f"""{MODEL}{DEVICE}{DATA}
 --max-mb MB  with --html: largest size of the file in megabytes (default: {MAX_MB})
 --classic  for viewers without antialiasing: write opacities that make up for it
 --spz-tiles  with --tiles: SPZ inside the tiles, for CesiumJS, and no page
 --tile-gaussians N  with --tiles and --streamed-sog: Gaussians of a tile (default: 32768)
 --processes N  with --tiles and --streamed-sog: processes that write tiles (default: as many as CPU cores)
-"""
-SELECTION = """
+--coordinates {"|".join(COORDINATES)}|world  capture: the capture's coordinates; centred: relative to the
+    model's origin; auto: the capture's if float32 can hold them; world: those of RUN/geo.json (`blitzgs
+    align`), as auto (default: auto)
+--clean [K=1]  leave out floaters and fringes that at most K training photographs saw (default: %(const)s)
+--sh-degree 0|1|2|3  write at most this SH degree
+--crop-axes xy|xz|yz  axes of the polygon's corners (default: xy)
 --crop-polygon FILE  keep this region: a GeoJSON polygon, or lines "x y", in the coordinates of --crop
 --min-opacity O  keep Gaussians of at least this opacity
 --most N  keep the N Gaussians that contribute most to views of the capture (of a file, and in tiles and
@@ -101,41 +106,22 @@ SELECTION = """
 --levels FIRST-LAST  keep these octree levels, for example 0-3
 """
 _TILES = "--tiles and --streamed-sog"
-_COUNT = arguments.number(int, lambda value: value >= 1, "a whole number from 1 on")
-_OPACITY = arguments.number(float, lambda value: 0 <= value < 1, "from 0 to below 1")
-_MB = arguments.number(float, lambda mb: 0 < mb <= LARGEST_MB, f"a number of megabytes up to {LARGEST_MB}")
 
 
-def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) -> None:
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = arguments.add_command(commands, "export", run, summary, HELP)
-    arguments.add_model(parser)
-    arguments.add_device(parser)
-    arguments.add_capture(parser)
-    kind = parser.add_mutually_exclusive_group(required=True)
-    for name, found in FORMATS.items():
-        arguments.add_path(kind, f"--{name}", "FILE", f"{found.title} file to write")
-    arguments.add_flags(kind, FOLDERS)
-    arguments.add_flags(parser, FLAGS, {"--max-mb": _MB, "--tile-gaussians": _COUNT, "--processes": _COUNT})
-    parser.add_argument(
-        "--coordinates",
-        choices=(*COORDINATES, "world"),
-        help="capture: the capture's coordinates; centred: relative to the model's origin; auto: the "
-        "capture's if float32 can hold them; world: those of RUN/geo.json (`blitzgs align`), as auto "
-        "(default: auto)",
-    )
-    parser.add_argument(
-        "--clean",
-        type=_COUNT,
-        nargs="?",
-        const=1,
-        metavar="K",
-        help="leave out floaters and fringes that at most K training photographs saw (default: %(const)s)",
-    )
-    _add_selection(parser)
-
-
-def _add_selection(parser: argparse.ArgumentParser) -> None:
+    count = number(int, lambda value: value >= 1, "a whole number from 1 on")
+    types: Types = {
+        **dict.fromkeys(("--tile-gaussians", "--processes", "--most", "--clean"), count),
+        "--max-mb": number(
+            float, lambda mb: 0 < mb <= LARGEST_MB, f"a number of megabytes up to {LARGEST_MB}"
+        ),
+        "--min-opacity": number(float, lambda value: 0 <= value < 1, "from 0 to below 1"),
+        "--levels": _levels,
+        "--sh-degree": int,
+    }
+    parser = add_command(commands, "export", run, summary, HELP, ARGUMENTS, types, device="auto")
+    add_arguments(parser.add_mutually_exclusive_group(required=True), KINDS)
     parser.add_argument(
         "--crop",
         type=float,
@@ -143,11 +129,6 @@ def _add_selection(parser: argparse.ArgumentParser) -> None:
         metavar=tuple("xyzXYZ"),
         help="keep this box, in the capture's coordinates (with --coordinates world: the world's)",
     )
-    parser.add_argument(
-        "--crop-axes", choices=("xy", "xz", "yz"), help="axes of the polygon's corners (default: xy)"
-    )
-    parser.add_argument("--sh-degree", type=int, choices=range(4), help="write at most this SH degree")
-    arguments.add_flags(parser, SELECTION, {"--min-opacity": _OPACITY, "--most": _COUNT, "--levels": _levels})
 
 
 def run(args: argparse.Namespace) -> None:

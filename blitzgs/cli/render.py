@@ -22,8 +22,7 @@ from torch import Tensor
 from blitzgs.capture.cameras import camera_centres
 from blitzgs.capture.pictures import encode_image, to_uint8
 from blitzgs.capture.usable import read_cameras
-from blitzgs.cli import arguments
-from blitzgs.cli.arguments import chosen_views
+from blitzgs.cli.arguments import DEVICES, MODEL, POOL, SPLIT, Commands, add_command, chosen_views, number
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files, trained_model
@@ -47,7 +46,7 @@ _DEPTH = (
     "depth in the capture's unit = value * scale; 0: nothing is there; 65535: this far or farther. The depth "
     "is along the axis of view, the mean of what a pixel shows."
 )
-_POSITIVE = arguments.number(float, lambda value: 0 < value < 1e6, "a positive number")
+_POSITIVE = number(float, lambda value: 0 < value < 1e6, "a positive number")
 
 HELP = """\
 Render views of a model to pictures, or a camera path to a film:
@@ -63,7 +62,9 @@ program (PLY, compressed PLY, SPZ, SOG, .splat). Films need the package av: pip 
 """
 
 
-FLAGS = """
+ARGUMENTS = f"""{MODEL}{DEVICES}{POOL}{SPLIT}
+--data DIR  read the cameras anew from this capture, that of the run (of others: --cameras)
+--out DIR|FILE  folder for pictures, or FILE{SUFFIX} (required)
 --cameras FILE  render the cameras of this transforms file or folder of a COLMAP model, in the capture's
     coordinates; no photographs are needed
 --path NAME|FILE  render the frames of a camera path: a file, or orbit (around the scene), flight (across it)
@@ -80,17 +81,10 @@ FLAGS = """
 """
 
 
-def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) -> None:
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = arguments.add_command(commands, "render", run, summary, HELP)
-    arguments.add_model(parser)
-    text = "--data DIR  read the cameras anew from this capture, that of the run (of others: --cameras)"
-    arguments.add_flags(parser, text)
-    arguments.add_device(parser, shares_gpus=True)
-    arguments.add_pool(parser)
-    arguments.add_split(parser, "render")
-    arguments.add_path(parser, "--out", "DIR|FILE", f"folder for pictures, or FILE{SUFFIX}", required=True)
-    arguments.add_flags(parser, FLAGS, {"--size": _size, "--fps": _POSITIVE, "--seconds": _POSITIVE})
+    types = {"--size": _size, "--fps": _POSITIVE, "--seconds": _POSITIVE}
+    add_command(commands, "render", run, summary, HELP, ARGUMENTS, types, device="auto", split="test")
 
 
 _OTHER_FILES = (".gif", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".webp", ".png", ".jpg", ".jpeg")

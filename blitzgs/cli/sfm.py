@@ -12,7 +12,7 @@ from pathlib import Path
 
 from blitzgs.capture.colmap import camera_models, find_models
 from blitzgs.capture.transforms import find_transforms
-from blitzgs.cli.arguments import Commands, add_command, add_path
+from blitzgs.cli.arguments import Commands, add_command
 from blitzgs.config.fields import Config
 from blitzgs.config.files import changed
 from blitzgs.runs.run_files import CONFIG
@@ -41,17 +41,17 @@ photographs without a pose and why), and COLMAP's database and messages.
 """
 
 
+ARGUMENTS = f"""
+photos PHOTOS  folder of the photographs
+capture CAPTURE  folder to write
+--pairs {"|".join(PAIRS)}  which photographs are compared (default: see above)
+--mapper {"|".join(MAPPERS)}  how poses are found (default: see above)
+"""
+
+
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "sfm", run, summary, HELP)
-    add_path(parser, "photos", "PHOTOS", "folder of the photographs")
-    add_path(parser, "capture", "CAPTURE", "folder to write")
-    parser.add_argument(
-        "--pairs", choices=PAIRS, default="auto", help="which photographs are compared (default: see above)"
-    )
-    parser.add_argument(
-        "--mapper", choices=MAPPERS, default="auto", help="how poses are found (default: see above)"
-    )
+    parser = add_command(commands, "sfm", run, summary, HELP, ARGUMENTS, pairs="auto", mapper="auto")
     parser.add_argument(
         "--camera-model",
         choices=("auto", *(name for name in camera_models() if name != "EQUIRECTANGULAR")),
@@ -156,9 +156,8 @@ Where the median miss falls by less than a tenth, NEW has the model of CAPTURE.
 
 def add_refine(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "refine", run_refine, summary, REFINE_HELP)
-    add_path(parser, "capture", "CAPTURE", "folder of a capture with a COLMAP model")
-    add_path(parser, "new", "NEW", "folder to write")
+    text = "capture CAPTURE  folder of a capture with a COLMAP model\nnew NEW  folder to write"
+    add_command(commands, "refine", run_refine, summary, REFINE_HELP, text)
 
 
 def run_refine(args: argparse.Namespace) -> None:
