@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -61,8 +62,7 @@ class Spawns:
     @property
     def times(self) -> NDArray[np.float32]:
         """When they were born, images."""
-        times: NDArray[np.float32] = self.features[:, FEATURES.index("time")]
-        return times
+        return self.features[:, FEATURES.index("time")]
 
     def only(self, rows: NDArray[np.bool_]) -> Spawns:
         """Return some of the spawns."""
@@ -135,16 +135,11 @@ def check_outcomes(survived: NDArray[np.bool_], source: object) -> None:
 
 def with_distinct_names(runs: Sequence[Spawns]) -> list[Spawns]:
     """Number runs that have the same name (of their capture's folder): `capture`, `capture_2`."""
-    found: list[Spawns] = []
-    names: set[str] = set()
+    names: list[str] = []
     for run in runs:
-        name, number = run.name, 1
-        while name in names:
-            number += 1
-            name = f"{run.name}_{number}"
-        names.add(name)
-        found.append(dataclasses.replace(run, name=name))
-    return found
+        possible = itertools.chain([run.name], (f"{run.name}_{number}" for number in itertools.count(2)))
+        names.append(next(name for name in possible if name not in names))
+    return [dataclasses.replace(run, name=name) for run, name in zip(runs, names, strict=True)]
 
 
 def auc(scores: NDArray[Any], positive: NDArray[np.bool_]) -> float:
@@ -291,8 +286,7 @@ def evaluate(
             where, actual, predicted = region_rates(run.only(late), scores[late])
             result["regions"] = {"cells": int(where.sum()), "r": correlation(actual[where], predicted[where])}
             names = ("share that survived (orange: none, blue: all)", "share that the gate predicts")
-            picture = maps(dict(zip(names, (actual, predicted), strict=True)))
-            output.write(path, _utf8(picture))
+            output.write(path, _utf8(maps(dict(zip(names, (actual, predicted), strict=True)))))
         curves[run.name] = [(entry["until"], entry["survived"]) for entry in cohorts]
         results.append(result)
     chart = line_chart(curves, "born at, images", "share that reaches the final model", most=1.0)
@@ -309,12 +303,8 @@ def survival_by_cohort(run: Spawns) -> list[dict[str, float]]:
     """Return, for equal stretches of birth time, how many were born and which share of them survived."""
     edges = np.linspace(run.times.min(), run.times.max(), COHORTS + 1)
     cohort = np.clip(np.searchsorted(edges, run.times, side="left") - 1, 0, COHORTS - 1)
-    found = []
-    for k in range(COHORTS):
-        mine = run.survived[cohort == k]
-        if len(mine):
-            found.append({"until": float(edges[k + 1]), "born": len(mine), "survived": float(mine.mean())})
-    return found
+    parts = [(float(edge), run.survived[cohort == k]) for k, edge in enumerate(edges[1:])]
+    return [{"until": end, "born": len(own), "survived": float(own.mean())} for end, own in parts if len(own)]
 
 
 def region_rates(

@@ -12,7 +12,7 @@ A Gaussian without a death is alive. At each checkpoint, births - deaths must eq
 number and in the sum of the hashes of all ids, or the run fails. A run that is resumed from a checkpoint
 deletes the parts written after it.
 
-An event only queues work on the device that makes its rows. Other threads copy the rows and write them.
+An event only queues work on the device that makes its rows. Another thread copies the rows and writes them.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ class Lineage:
         self._writer.close()
 
     def flush(self, step: int) -> None:
-        """Let other threads write the pending rows."""
+        """Let another thread write the pending rows."""
         for table, blocks in self._pending.items():
             if not blocks:
                 continue

@@ -28,27 +28,22 @@ TABLES: dict[str, tuple[tuple[str, ...], ...]] = {
     "births": (("id", "parent"), ("x", "y", "z", *FEATURES)),  # int64, float32
     "deaths": (("id",), ("time",), ("cause",)),  # int64, int32, uint8
 }
-# Bytes of pinned memory through which rows come from the GPU. More rows take several copies.
-_STAGING_BYTES = 8 << 20
-
 _Columns = dict[str, np.ndarray[Any, Any]]
 
 
 class PartWriter:
     """Writes parts of a lineage in the order in which they were added, without keeping their caller waiting.
 
-    One thread copies rows from the device in a stream of its own, and another writes them. So a slow disk
-    delays no copy, and rows leave the device's memory soon.
+    A thread copies rows from the device, in a stream of its own, and writes them.
     """
 
     def __init__(self, folder: Path, device: torch.device) -> None:
-        """Start the threads, which wait for parts (ImportError: pyarrow is not installed)."""
+        """Start the thread, which waits for parts (ImportError: pyarrow is not installed)."""
         self._parquet = import_pyarrow()
         self._folder = folder
-        self._to_host = _HostArrays(device)
-        self._copier = ThreadPoolExecutor(1, "lineage copy")
-        self._writer = ThreadPoolExecutor(1, "lineage")
-        self._copying: list[Future[Future[None]]] = []
+        self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
+        self._thread = ThreadPoolExecutor(1, "lineage")
+        self._writing: list[Future[None]] = []
         self._failed: list[tuple[str, _Columns, OSError]] = []
 
     def add(self, name: str, table: str, groups: Sequence[Tensor]) -> None:
@@ -56,17 +51,14 @@ class PartWriter:
 
         Groups are columns as in `TABLES`, contiguous; they must not change any more.
         """
-        ready = None
-        if groups[0].is_cuda:
-            ready = torch.cuda.Event()
-            ready.record(current_stream(groups[0].device))
-        self._copying.append(self._copier.submit(self._copy, name, table, groups, ready))
+        ready = None if self._stream is None else current_stream(groups[0].device).record_event()
+        self._writing.append(self._thread.submit(self._copy_and_write, name, table, groups, ready))
 
     def finish(self) -> list[OSError]:
         """Wait until all parts are written, and try those again that could not be; return what went wrong."""
-        for copying in self._copying:
-            copying.result().result()
-        self._copying.clear()
+        for writing in self._writing:
+            writing.result()
+        self._writing.clear()
         failed, self._failed = self._failed, []
         for name, columns, _ in failed:
             self._write(name, columns)
@@ -74,17 +66,18 @@ class PartWriter:
 
     def close(self) -> None:
         """Finish the part that is being written, and drop those behind it."""
-        self._copier.shutdown(wait=True, cancel_futures=True)
-        self._writer.shutdown(wait=True, cancel_futures=True)
+        self._thread.shutdown(wait=True, cancel_futures=True)
 
-    def _copy(
+    def _copy_and_write(
         self, name: str, table: str, groups: Sequence[Tensor], ready: torch.cuda.Event | None
-    ) -> Future[None]:
-        """Copy rows to the host and hand them to the thread that writes them."""
+    ) -> None:
         columns: _Columns = {}
-        for names, group in zip(TABLES[table], groups, strict=True):
-            columns |= dict(zip(names, self._to_host(group, ready), strict=True))
-        return self._writer.submit(self._write, name, columns)
+        with torch.cuda.stream(self._stream):  # so that copies wait for no later work
+            if ready is not None:
+                ready.wait()
+            for names, group in zip(TABLES[table], groups, strict=True):
+                columns |= dict(zip(names, group.cpu().numpy(), strict=True))
+        self._write(name, columns)
 
     def _write(self, name: str, columns: _Columns) -> None:
         arrow, parquet = self._parquet
@@ -96,39 +89,6 @@ class PartWriter:
                 parquet.write_table(arrow.table(columns), file, compression="zstd", use_dictionary=False)
         except OSError as error:
             self._failed.append((name, columns, error))
-
-
-class _HostArrays:
-    """Copies tensors from a GPU to the host, in a stream of its own and through pinned memory.
-
-    The pinned memory is allocated once, because an allocation makes the whole device wait.
-    """
-
-    def __init__(self, device: torch.device) -> None:
-        is_gpu = device.type == "cuda"
-        self._stream = torch.cuda.Stream(device) if is_gpu else None
-        self._staging = torch.empty(_STAGING_BYTES if is_gpu else 0, dtype=torch.uint8, pin_memory=is_gpu)
-
-    def __call__(self, source: Tensor, ready: torch.cuda.Event | None) -> np.ndarray[Any, Any]:
-        """Return the values of a contiguous tensor, which exist when `ready` happens; None: they exist.
-
-        An array of a tensor on the CPU shares its memory.
-        """
-        if self._stream is None or ready is None:
-            return source.numpy()
-        flat = source.view(-1).view(torch.uint8)
-        target = np.empty(len(flat), dtype=np.uint8)
-        with torch.cuda.stream(self._stream):
-            self._stream.wait_event(ready)
-            for begin in range(0, len(flat), _STAGING_BYTES):
-                piece = flat[begin : begin + _STAGING_BYTES]
-                self._staging[: len(piece)].copy_(piece, non_blocking=True)
-                # Only after this wait may the caller drop `source`, whose memory belongs to another stream.
-                self._stream.synchronize()
-                # NumPy copies in this thread alone; torch would start a team of threads for it.
-                target[begin : begin + len(piece)] = self._staging[: len(piece)].numpy()
-        dtype = torch.empty(0, dtype=source.dtype).numpy().dtype
-        return target.view(dtype).reshape(tuple(source.shape))
 
 
 def read_lineage(folder: Path) -> dict[str, dict[str, Any]]:
