@@ -238,8 +238,7 @@ class Ranks:
         holder: list[Any] = [value]
         with self.watchdog.waiting("broadcast_object"):
             dist.broadcast_object_list(holder, device=self.device)
-        result: T = holder[0]
-        return result
+        return holder[0]
 
     def barrier(self) -> None:
         """Wait for all ranks."""

@@ -145,5 +145,4 @@ def tour_of(cameras: Sequence[Camera], points: Float64) -> list[int]:
     middles = np.array([np.median(seen) if len(seen) else 0.0 for seen in depths])
     # Row 2 of a pose is the optical axis.
     places = camera_centres(poses) + middles[:, None] * poses[:, 2, :3]
-    order: list[int] = morton_order(torch.from_numpy(places)).tolist()
-    return order
+    return morton_order(torch.from_numpy(places)).tolist()
