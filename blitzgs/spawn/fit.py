@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from blitzgs.spawn.candidates import FEATURES
 from blitzgs.spawn.gate import GateInfo, SpawnGate, check_no_other, write_info
-from blitzgs.spawn.lineage import ABOUT
-from blitzgs.spawn.lineage_parts import read_lineage
+from blitzgs.spawn.lineage import ABOUT, read_lineage
 from blitzgs.util.charts import line_chart, maps
 from blitzgs.util.errors import optional_package
 from blitzgs.util.output import OutputFolder, write_file

@@ -13,7 +13,7 @@ import torch
 from blitzgs.ops.counter_random import uniform
 from blitzgs.spawn.candidates import FEATURES
 from blitzgs.spawn.fit import AXES, Spawns, read_about, spawns_of
-from blitzgs.spawn.lineage_parts import check_columns, import_pyarrow, read_numbers
+from blitzgs.spawn.lineage import check_columns, import_pyarrow, read_numbers
 from blitzgs.util.output import check_replaceable, new_file
 
 SUFFIX = ".parquet"

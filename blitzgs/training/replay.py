@@ -42,7 +42,7 @@ from blitzgs.runs.checkpoint_files import MANIFEST
 from blitzgs.runs.folder_checks import locked
 from blitzgs.spawn.candidates import Candidates, Veto
 from blitzgs.spawn.gate import SpawnGate, random_veto, rank_veto, sampled_veto, veto_draws, veto_lowest
-from blitzgs.spawn.lineage_parts import read_lineage
+from blitzgs.spawn.lineage import read_lineage
 from blitzgs.training.trainer import Trainer
 from blitzgs.util.errors import warn
 
@@ -87,9 +87,8 @@ def label_events(lineage: Path) -> tuple[Tensor, Tensor]:
     tables = read_lineage(lineage)
     births, deaths = tables["births"], tables["deaths"]
     spawned = births["parent"] >= 0
-    parents, times, splits = (
-        torch.from_numpy(births[name][spawned]) for name in ("parent", "time", "is_split")
-    )
+    columns = (births[name][spawned] for name in ("parent", "time", "is_split"))
+    parents, times, splits = map(torch.from_numpy, columns)
     keys = event_keys(parents, times.long(), splits.bool()).numpy()
     survived = ~np.isin(births["id"][spawned], deaths["id"])
     known = np.unique(keys)
@@ -246,9 +245,7 @@ def _branch(point: Path, folder: Path) -> None:
 def _check_comparable(config: Config, capture: Capture, images: ImageStore, source: Path) -> None:
     """Check that arms can be branched from a run and that their results can be compared."""
     if not config.population.lineage:
-        raise ValueError(
-            f"{source} was trained without --population.lineage=true: there is nothing to branch"
-        )
+        raise ValueError(f"{source} was trained without --population.lineage=true: nothing can be branched")
     if config.population.strategy == "relocation":
         raise ValueError(
             f"{source} was trained with population.strategy=relocation, which has no candidates: replay a "
