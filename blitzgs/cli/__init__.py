@@ -104,8 +104,7 @@ def _run(given: list[str]) -> int:
         # Those of Python's imports and of YAML have lines.
         lines = isinstance(error, ImportError) or type(error).__name__ == "ConfigError"
         text = f"{name}: {printable(_message(error), lines)}"
-        console = Console(stderr=True, highlight=False, emoji=False)
-        console.print(text, style="red", markup=False, soft_wrap=True)
+        Console(stderr=True).out(text, style="red", highlight=False)
         return 1
 
 
@@ -172,11 +171,8 @@ def _importing(name: str) -> Iterator[None]:
 
 def _message(error: BaseException) -> str:
     """Return the error's text; for an error of the operating system, the file and the reason."""
-    if isinstance(error, MemoryError):
-        return (
-            str(error)
-            or "the memory is not sufficient: use smaller images (--data.downscale) or a larger machine"
-        )
+    if isinstance(error, MemoryError) and not str(error):
+        return "the memory is not sufficient: use smaller images (--data.downscale) or a larger machine"
     if not isinstance(error, OSError) or error.filename is None or error.strerror is None:
         return str(error)
     if isinstance(error, (FileExistsError, NotADirectoryError)):

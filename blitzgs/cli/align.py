@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+from contextlib import suppress
 
 import numpy as np
 
@@ -95,12 +96,9 @@ def _by_points(args: argparse.Namespace, capture: Capture) -> WorldFrame:
 
 def _check_lengths(crs: str) -> None:
     """Refuse a reference system of angles, in which points make no similarity; unknown without pyproj."""
-    try:
-        system = reference_system(crs)
-    except ImportError:
-        return
-    if system.is_geographic:
-        raise ValueError(f"{crs} has angles: convert the points to a projected system, such as a UTM zone")
+    with suppress(ImportError):
+        if reference_system(crs).is_geographic:
+            raise ValueError(f"{crs} has angles: convert the points to a projected system, as a UTM zone")
 
 
 def _warn_if_turned_over(frame: WorldFrame, capture: Capture) -> None:
@@ -161,13 +159,10 @@ def _converted(args: argparse.Namespace, capture: Capture) -> WorldFrame:
     if known is None or not known.crs:
         _check_lengths(args.crs)
         frame = known or WorldFrame()
-        return dataclasses.replace(
-            frame, crs=args.crs, source=frame.source or "the capture's own coordinates"
-        )
+        source = frame.source or "the capture's own coordinates"
+        return dataclasses.replace(frame, crs=args.crs, source=source)
     some = capture.points[:: max(1, len(capture.points) // 1000)] + capture.offset
     places = np.concatenate([_centres(capture), some])
     frame, error = frame_in(known, args.crs, places)
-    print(
-        f"a similarity instead of the projection is wrong by at most {error:.3g} m at the cameras and points"
-    )
+    print(f"a similarity for the projection is wrong by at most {error:.3g} m at the cameras and points")
     return frame

@@ -37,7 +37,7 @@ from blitzgs.runs.run_files import run_and_checkpoint
 from blitzgs.runs.source import Watched, open_source, source_of
 from blitzgs.runs.world import in_world, load_world_frame
 from blitzgs.util.output import write_file
-from blitzgs.util.progress import ending_by_exception, image_progress
+from blitzgs.util.progress import Report, ending_by_exception, image_progress
 
 # Default of --max-mb, and the largest file whose text browsers still hold in one piece.
 MAX_MB, LARGEST_MB = 50, 500
@@ -171,9 +171,7 @@ def _export_tiles(args: argparse.Namespace, selection: Selection | None) -> None
         def write_streamed(folder: Path, found: GaussianSource) -> None:
             done.append(write_streamed_sog(folder, found, most, processes, report))
 
-        source = Watched(source, report)
-        if selection is not None:
-            source = Selected(source, selection, (x, y, z))
+        source = _chosen(source, report, selection, (x, y, z))
         if args.tiles:
             place = city.transform(), city.scene, city.title
             done.append(write_tiles(path, source, *place, most, processes, report, args.spz_tiles))
@@ -227,9 +225,7 @@ def _export_file(args: argparse.Namespace) -> None:
             raise ValueError(f"{path} is the model itself, which would be lost: choose another name")
         source = open_gaussians(args.model, checked=selection is None)
         with image_progress("Exporting", unit="Gaussians") as report:
-            source = Watched(source, report)
-            if selection is not None:
-                source = Selected(source, selection, offset_of(source.comments))
+            source = _chosen(source, report, selection, offset_of(source.comments))
             written = export_file(source, kind, path)
     else:
         source, written = _export_run(args, kind, path, selection)
@@ -249,9 +245,7 @@ def _export_run(
     opened = open_source(run_folder, checkpoint)
     if not in_memory:
         with image_progress("Exporting", unit="Gaussians") as report:
-            source: GaussianSource = Watched(opened, report)
-            if selection is not None:
-                source = Selected(source, selection, opened.space.offset)
+            source = _chosen(opened, report, selection, opened.space.offset)
             return source, export(source, opened.space, kind, path, coordinates)
     flags = "--classic, --clean, --most and --coordinates world need the model in memory"
     # The model is read with the optimiser's two moments, and copied.
@@ -267,13 +261,11 @@ def _export_run(
         if args.clean is not None:
             kept = _cleaned(model, run_folder, args, path, ranks)
         if args.classic and not model.config.model.antialiased:
-            print(
-                "--classic changes nothing: the model was trained without model.antialiased", file=sys.stderr
-            )
+            text = "--classic changes nothing: the model was trained without model.antialiased"
+            print(text, file=sys.stderr)
         elif args.classic:
-            print(
-                "antialiasing is baked into the opacities: right at the training views' distance, else nearly"
-            )
+            right = "right at the training views' distance, else nearly"
+            print(f"antialiasing is baked into the opacities: {right}")
             stored = folder.cameras()
             model = without_antialiasing(model, [stored.cameras[index] for index in stored.train])
         crs = None
@@ -288,16 +280,23 @@ def _export_run(
     return source, export(source, model.space, kind, path, coordinates, crs)
 
 
+def _chosen(
+    source: GaussianSource, report: Report, selection: Selection | None, offset: tuple[float, float, float]
+) -> GaussianSource:
+    """Return what the flags choose of a source, whose reading is reported."""
+    watched = Watched(source, report)
+    return watched if selection is None else Selected(watched, selection, offset)
+
+
 def _cleaned(model: Model, folder: Path, args: argparse.Namespace, path: Path, ranks: Ranks) -> torch.Tensor:
     """Tell which Gaussians --clean keeps; write the picture, and print what it costs."""
     cameras = open_run(folder).cameras()
     found = cleaned(model, cameras, args.clean, ranks, photographs(folder, args.data))
     picture = path.with_name(path.name + ".clean.jpg")
-    gone, shown = len(model) - int(found.kept.sum()), ""
     if found.picture is not None:
         write_file(picture, found.picture)
-        shown = f", see {picture}"
-    print(f"--clean: {gone:,} of {len(model):,} Gaussians go{shown}")
+    shown = "" if found.picture is None else f", see {picture}"
+    print(f"--clean: {len(model) - int(found.kept.sum()):,} of {len(model):,} Gaussians go{shown}")
     if found.psnr is not None:
         before, after = found.psnr
         print(f"held-out PSNR: {before:.3f} dB before, {after:.3f} dB after")
@@ -317,10 +316,11 @@ def _selection(args: argparse.Namespace) -> Selection | None:
     box = None if args.crop is None else np.array(args.crop).reshape(2, 3)
     if box is not None and not (box[0] < box[1]).all():
         raise ValueError(f"--crop takes the least x y z, then the largest, got {args.crop}")
+    first, second = args.crop_axes or "xy"
     return Selection(
         box=box,
         polygon=None if args.crop_polygon is None else read_polygon(args.crop_polygon),
-        axes=("xyz".index((args.crop_axes or "xy")[0]), "xyz".index((args.crop_axes or "xy")[1])),
+        axes=("xyz".index(first), "xyz".index(second)),
         min_opacity=args.min_opacity or 0.0,
         levels=args.levels,
         sh_degree=args.sh_degree,

@@ -17,8 +17,8 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.runs import run_files
 from blitzgs.runs.folder import open_run
 from blitzgs.spawn import fit as gate_fit
-from blitzgs.spawn import samples
 from blitzgs.spawn.gate import SpawnGate, gate_file
+from blitzgs.spawn.samples import MAX_ROWS, SUFFIX, read_sample, write_sample
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.replay import FIGURES, TABLE, replay
 from blitzgs.util.output import OutputFolder
@@ -71,12 +71,10 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     }
     parser = add_command(commands, "gate", lambda _: 2, summary, HELP)
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    again = (
-        "continue one checkpoint several times: without a gate, with it, with an oracle, with random vetoes"
-    )
+    again = "continue one checkpoint several times: without a gate, with it, an oracle and random vetoes"
     for name, function, what, text, defaults in (
         ("fit", run_fit, "fit a gate on the lineage of runs", FIT, {"gate_from": ScheduleConfig.gate_from}),
-        ("sample", run_sample, "reduce the lineage of a run to one file", SAMPLE, {"rows": samples.MAX_ROWS}),
+        ("sample", run_sample, "reduce the lineage of a run to one file", SAMPLE, {"rows": MAX_ROWS}),
         ("evaluate", run_evaluate, "measure a gate on the lineage of runs", EVALUATE, {}),
         ("replay", run_replay, again, REPLAY, {"rate": 0.6, "device": "auto"}),
     ):
@@ -87,9 +85,7 @@ def run_fit(args: argparse.Namespace) -> None:
     """Fit a gate."""
     if args.out.suffix != ".json":
         raise ValueError(f"--out {args.out}: a gate's file ends in .json")
-    runs = [
-        samples.read_sample(path) if path.suffix == samples.SUFFIX else _spawns_of(path) for path in args.runs
-    ]
+    runs = [(read_sample if path.suffix == SUFFIX else _spawns_of)(path) for path in args.runs]
     args.out.parent.mkdir(parents=True, exist_ok=True)
     figures = gate_fit.fit(runs, args.out, args.gate_from)
     print(f"{args.out}: fitted on {len(runs)} run{'s' * (len(runs) > 1)}; {figures['protocol']}:")
@@ -99,11 +95,11 @@ def run_fit(args: argparse.Namespace) -> None:
 
 def run_sample(args: argparse.Namespace) -> None:
     """Write a sample of spawns."""
-    if args.out.suffix != samples.SUFFIX:
-        raise ValueError(f"--out {args.out}: a sample's file ends in {samples.SUFFIX}")
+    if args.out.suffix != SUFFIX:
+        raise ValueError(f"--out {args.out}: a sample's file ends in {SUFFIX}")
     run = _spawns_of(args.folder)
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    rate = samples.write_sample(run, args.out, args.rows)
+    rate = write_sample(run, args.out, args.rows)
     print(f"{args.out}: {rate:.2%} of {len(run.survived):,} spawns of {run.name}")
 
 
@@ -122,8 +118,7 @@ def run_evaluate(args: argparse.Namespace) -> None:
     for result in results:
         seen = "  (the gate was fitted on this scene)" if result["seen"] else ""
         r = result.get("regions", {}).get("r")
-        regions = "" if r is None else f"; regions r {r:.2f}"
-        print(_judgement(result) + regions + seen)
+        print(_judgement(result) + ("" if r is None else f"; regions r {r:.2f}") + seen)
     print(f"{args.out}: {figures.name}, {gate_fit.SURVIVAL} and maps of regions")
 
 
@@ -155,8 +150,9 @@ def _spawns_of(folder: Path) -> gate_fit.Spawns:
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is not the folder of a run")
     lineage = folder / run_files.LINEAGE
-    summary = open_run(folder).summary() if lineage.is_dir() else {}
-    if lineage.is_dir() and not summary:
+    if not lineage.is_dir():
+        return gate_fit.read_spawns(lineage)  # which says what is missing
+    if not (summary := open_run(folder).summary()):
         raise ValueError(
             f"{folder} is not finished (it has no {run_files.SUMMARY}), so it is not known which Gaussians "
             "survive; finish it with blitzgs train ... --resume"

@@ -93,18 +93,17 @@ _OTHER_FILES = (".gif", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".webp", ".png"
 def run(args: argparse.Namespace) -> None:
     """Render views."""
     film = _film(args)
-    is_film = args.out.suffix.lower() == SUFFIX
+    is_film = film is not None and args.out.suffix.lower() == SUFFIX
     if film is not None and is_film:
         check_film(args.out, film.width, film.height)
     with Ranks.from_environment(args.device, share_gpus=args.share_gpus) as ranks:
         opened = open_rendered(args, film, ranks)
-        if is_film and film is not None:
+        if film is not None and is_film:
             _render_film(args.out, opened, film, ranks)
         else:
             _render_pictures(args, opened, ranks)
         if ranks.rank == 0:
-            count, what = len(opened.indices), "frames" if is_film else "images"
-            print(f"{args.out}: {count} {what}")
+            print(f"{args.out}: {len(opened.indices)} {'frames' if is_film else 'images'}")
 
 
 def _film(args: argparse.Namespace) -> Film | None:
@@ -166,7 +165,6 @@ def _render_pictures(args: argparse.Namespace, opened: Rendered, ranks: Ranks) -
     modes: list[Mode] = [mode for mode in MEASURED if getattr(args, mode)]
     paths = {mode: output.paths(names, f".{mode}{suffix}") for mode in modes}
     colours = output.paths(names, suffix)
-    args.out.mkdir(parents=True, exist_ok=True)
     step = _depth_step(opened)
     if "depth" in modes and not args.raw and ranks.rank == 0:
         scale = json.dumps({"scale": step, "meaning": _DEPTH}, indent=1) + "\n"
@@ -185,8 +183,7 @@ def _render_pictures(args: argparse.Namespace, opened: Rendered, ranks: Ranks) -
                 camera = opened.cameras[index]
                 pose = viewmat(camera, opened.subject.space)
                 look = Look(pose, np.asarray(camera.K), camera.width, camera.height, mode)
-                picture = drawer.draw(look) if drawer else None
-                if picture is not None:
+                if drawer is not None and (picture := drawer.draw(look)) is not None:
                     values = picture.values.astype(np.float32)
                     full = 65535.0 if mode == "alpha" else 1 / step
                     output.write(paths[mode][index], _npy(values) if args.raw else _png16(values * full))
@@ -256,6 +253,7 @@ def open_rendered(args: argparse.Namespace, film: Film | None, ranks: Ranks) -> 
         box = _shared_box(model.table, ranks)
         stored = _stored_cameras(args, folder, model, ranks)
         subject = model.subject(ranks)
+    inputs = stored.inputs if stored else []
     cameras: Sequence[CameraLike]
     if args.cameras is not None:
         cameras = read_cameras(args.cameras, np.array(subject.space.offset))
@@ -264,10 +262,9 @@ def open_rendered(args: argparse.Namespace, film: Film | None, ranks: Ranks) -> 
     elif stored is not None:
         shown = _exposures(exposures, stored) if args.exposure else {}
         indices = chosen_views(args.split, stored, args.model)
-        return Rendered(subject, box, stored.cameras, indices, stored.inputs, shown)
+        return Rendered(subject, box, stored.cameras, indices, inputs, shown)
     else:
         raise ValueError(f"{args.model} has no cameras: use --path, --cameras or the folder of a run")
-    inputs = stored.inputs if stored else []
     return Rendered(subject, box, cameras, range(len(cameras)), inputs, {})
 
 

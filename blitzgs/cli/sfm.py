@@ -64,9 +64,8 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Reconstruct."""
-    find_poses(
-        photograph_folder(args.photos), args.capture, Settings(args.pairs, args.mapper, args.camera_model)
-    )
+    settings = Settings(args.pairs, args.mapper, args.camera_model)
+    find_poses(photograph_folder(args.photos), args.capture, settings)
     _print_next(args.capture)
 
 
@@ -88,19 +87,15 @@ def with_poses(config: Config, folder: Path) -> Config:
     They go into `folder`, which is used as it is if it is finished. Under torchrun rank 0 finds them and the
     others, which have not joined yet, wait for its report; where rank 0 fails, torchrun ends them.
     """
-    photographs = _photographs_alone(config)
-    if photographs is None:
+    if (photographs := _photographs_alone(config)) is None:
         return config
-    first = os.environ.get("RANK", "0") == "0"
-    if is_finished(folder):
-        if first:
+    if os.environ.get("RANK", "0") == "0":
+        if is_finished(folder):
             print(f"poses: those of {folder}, found before (blitzgs sfm adds photographs)", file=sys.stderr)
-    elif first:
-        print(
-            f"{config.data.path} has photographs without poses: they are found first, into {folder}",
-            file=sys.stderr,
-        )
-        find_poses(photographs, folder, Settings())
+        else:
+            text = f"{config.data.path} has photographs without poses: they are found first, into {folder}"
+            print(text, file=sys.stderr)
+            find_poses(photographs, folder, Settings())
     while not is_finished(folder):
         time.sleep(1.0)
     return changed(config, "data", path=os.path.realpath(folder), images="images")
@@ -108,8 +103,7 @@ def with_poses(config: Config, folder: Path) -> Config:
 
 def understood_alone(config: Config) -> str | None:
     """Return what a training would do first with photographs that have no poses; None: they have."""
-    folder = _photographs_alone(config)
-    if folder is None:
+    if (folder := _photographs_alone(config)) is None:
         return None
     photographs = Photographs.of(folder)
     return (
@@ -168,10 +162,8 @@ def run_refine(args: argparse.Namespace) -> None:
 
 
 def _print_found(lines: list[str], begin: float) -> None:
-    print(
-        "\n".join(map(printable, [*lines, f"{'time:':15}{(time.monotonic() - begin) / 60:.1f} minutes"])),
-        flush=True,
-    )
+    for line in (*lines, f"{'time:':15}{(time.monotonic() - begin) / 60:.1f} minutes"):
+        print(printable(line), flush=True)
 
 
 def _print_next(capture: Path) -> None:

@@ -297,8 +297,11 @@ _FIGURES: dict[str, tuple[str, int, float]] = {
 
 def _print_summary(summary: dict[str, object], folder: Path, reported: bool) -> None:
     console, table = Console(emoji=False), Table(show_header=False)
-    # Print the path verbatim: rich must not interpret brackets and colons in it.
-    console.print(printable(str(folder)), markup=False, highlight=False, soft_wrap=True)
+
+    def say(text: str) -> None:  # as it is: rich must not interpret brackets and colons in paths
+        console.out(printable(text), highlight=False)
+
+    say(str(folder))
     if summary.get("split") == "train":
         console.print("no view is held out: the figures are those of the training views", style="yellow")
     for name, value in summary.items():
@@ -316,13 +319,12 @@ def _print_summary(summary: dict[str, object], folder: Path, reported: bool) -> 
         f"train --out {name} --extend 1.5": "train half as long again",
     }
     width = max(map(len, commands))
-    for text in (
-        *([f"report: {folder / run_files.REPORT}"] if reported else []),
-        f"pictures: {folder / run_files.EVALUATION}",
-        "next:",
-        *(f"  blitzgs {command:{width}}   {what}" for command, what in commands.items()),
-    ):
-        console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
+    if reported:
+        say(f"report: {folder / run_files.REPORT}")
+    say(f"pictures: {folder / run_files.EVALUATION}")
+    say("next:")
+    for command, what in commands.items():
+        say(f"  blitzgs {command:{width}}   {what}")
 
 
 def live_page(state: TrainingState, port: int, host: str) -> Live | None:

@@ -117,9 +117,8 @@ def tiles_server(folder: Path, host: str, port: int) -> ThreadingHTTPServer:
         tileset = json.loads((folder / TILESET).read_text(encoding="utf-8"))
         complete = tileset["asset"]["generator"] == "BlitzGS" and "view" in tileset["extras"]
     except (ValueError, LookupError, TypeError, RecursionError) as error:
-        raise ValueError(
-            f"{folder / TILESET} is damaged ({error}): write it again with blitzgs export"
-        ) from error
+        remedy = "write it again with blitzgs export"
+        raise ValueError(f"{folder / TILESET} is damaged ({error}): {remedy}") from error
     if not complete or not (folder / PAGE).is_file():
         raise ValueError(
             f"{folder} has no page of blitzgs export --tiles: it is another program's, or has SPZ inside "
