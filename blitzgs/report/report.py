@@ -136,11 +136,10 @@ def _pictures(data: RunData) -> list[dict[str, Any]]:
     found = []
     for label, names in (("worst", worst), ("best", best), ("", others)):
         for name in names:
-            layers = gather.layers(data, indices[name]) if name in indices else None
-            if layers is None:
+            if name not in indices or (layers := gather.layers(data, indices[name])) is None:
                 continue
             psnr = data.views[name].get("psnr")
-            note = " ".join(part for part in (label, "" if psnr is None else f"{psnr:.2f} dB") if part)
+            note = " ".join(filter(None, (label, "" if psnr is None else f"{psnr:.2f} dB")))
             shown = [{"label": part, "src": layers[part]} for part in ("photograph", "render", "error")]
             found.append({"name": gather.short_name(name), "note": note, "layers": shown})
     return found
