@@ -131,15 +131,13 @@ def _outskirts(b: MeshBuilder, plan: Plan, rng: Rng) -> None:
     """Scatter groups of trees and a few farms around the built-up square, off the roads that leave it."""
     edge, reach = plan.half + 12, plan.half + 0.5 * plan.options.extent
     for _ in range(int(np.clip(plan.options.extent / 2.5, 40, 1500))):
-        x, y = rng.uniform(-reach, reach, 2)
-        if max(abs(x), abs(y)) < edge or not _off_roads(plan, float(x), float(y), 12):
+        x, y = rng.uniform(-reach, reach, 2).tolist()
+        if max(abs(x), abs(y)) < edge or not _off_roads(plan, x, y, 12):
             continue
         if rng.random() < 0.08:
-            buildings.family_house(b, (float(x) - 8, float(y) - 8, float(x) + 8, float(y) + 8), rng)
+            buildings.family_house(b, (x - 8, y - 8, x + 8, y + 8), rng)
             continue
-        buildings.trees(
-            b, (float(x) - 5, float(y) - 5, float(x) + 5, float(y) + 5), int(rng.integers(1, 6)), (4, 9), rng
-        )
+        buildings.trees(b, (x - 5, y - 5, x + 5, y + 5), int(rng.integers(1, 6)), (4, 9), rng)
 
 
 def _off_roads(plan: Plan, x: float, y: float, margin: float) -> bool:

@@ -65,7 +65,7 @@ def plan_flight(options: CityOptions) -> list[View]:
     With several altitudes each of these is flown at the lowest first.
     """
     rng = np.random.default_rng([options.seed, 4])
-    lowest = flight_height(options)
+    lowest, focal = flight_height(options), 0.5 * options.width / math.tan(FIELD_OF_VIEW / 2)
     oblique = _oblique_count(options)
     per_heading = [oblique // 4 + (k < oblique % 4) for k in range(4)]
     passes: list[tuple[str, float, float, int]] = [("nadir", 0.0, 0.0, options.views - oblique)]
@@ -82,18 +82,10 @@ def plan_flight(options: CityOptions) -> list[View]:
             for position in _lawn_mower(count, flown):
                 ground = position + rng.normal(0, 0.01 * height, 2)
                 centre = np.array([*(ground - back * forward), height * (1 + rng.normal(0, 0.01))])
-                yaw, pitch, roll = np.array([heading, tilt, 0.0]) + rng.normal(0, math.radians(1.2), 3)
-                focal = 0.5 * options.width / math.tan(FIELD_OF_VIEW / 2)
-                views.append(
-                    View(
-                        name=f"{len(views):05d}_{label}.jpg",
-                        width=options.width,
-                        height=options.height,
-                        focal=focal,
-                        rotation=_rotation(float(yaw), float(pitch), float(roll)),
-                        centre=centre,
-                    )
-                )
+                angles = np.array([heading, tilt, 0.0]) + rng.normal(0, math.radians(1.2), 3)
+                name = f"{len(views):05d}_{label}.jpg"
+                rotation = _rotation(*angles.tolist())
+                views.append(View(name, options.width, options.height, focal, rotation, centre))
     return views
 
 

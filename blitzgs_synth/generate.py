@@ -115,13 +115,10 @@ def _reusable(out: Path, options: CityOptions, overwrite: bool) -> bool:
         if not isinstance(found, dict):
             raise ValueError("not a JSON object")
     except (OSError, ValueError, RecursionError) as error:
-        raise FileExistsError(
-            f"{out} holds no generated city ({MANIFEST}: {error}); choose another folder"
-        ) from error
-    wanted = options.manifest()
-    different = [
-        f"{key} {found.get(key)}, not {value}" for key, value in wanted.items() if found.get(key) != value
-    ]
+        what = f"holds no generated city ({MANIFEST}: {error})"
+        raise FileExistsError(f"{out} {what}; choose another folder") from error
+    pairs = [(key, found.get(key), value) for key, value in options.manifest().items()]
+    different = [f"{key} {mine}, not {wanted}" for key, mine, wanted in pairs if mine != wanted]
     if not different:
         return True
     if not overwrite:
@@ -247,9 +244,8 @@ def run(args: argparse.Namespace) -> None:
     given = {field.name: getattr(args, field.name) for field in fields(CityOptions)}
     chosen = asdict(PRESETS[args.preset]) | {name: v for name, v in given.items() if v is not None}
     started = time.monotonic()
+    how = {"processes": args.processes, "overwrite": args.overwrite}
     with image_progress("Photographing the city") as progress:
-        out = generate_city(
-            args.out, **chosen, processes=args.processes, overwrite=args.overwrite, progress=progress
-        )
+        out = generate_city(args.out, **chosen, **how, progress=progress)
     size = f"{chosen['views']} images of {chosen['width']} x {chosen['height']}"
     print(f"{out}: {size}, {time.monotonic() - started:.1f} s")

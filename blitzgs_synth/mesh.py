@@ -107,9 +107,8 @@ class MeshBuilder:
         count, round_count = len(corners), len(blobs)
         looks = self._looks + self._blob_looks
         unit = np.tile(np.eye(3)[None], (round_count, 1, 1))
-        surface = np.concatenate(
-            [np.repeat(np.arange(count), 2), count + np.repeat(np.arange(round_count), per_blob)]
-        )
+        of_blobs = count + np.repeat(np.arange(round_count), per_blob)
+        surface = np.concatenate([np.repeat(np.arange(count), 2), of_blobs])
         return Mesh(
             triangles=np.concatenate([quad_triangles, blob_triangles]).astype(np.float32),
             surface=surface.astype(np.int32),
