@@ -108,9 +108,8 @@ class Watchdog:
         self.name = "start"
         self.busy = ""
         self.waiting_since: float | None = None
-        self._heard: dict[
-            int, tuple[float, float]
-        ] = {}  # of each rank: its last stamp, and when it was new here
+        # Of each rank: its last stamp, and when it was new here.
+        self._heard: dict[int, tuple[float, float]] = {}
         self._announced = 0.0
         self._excused = 0.0  # when a late rank was last seen at work
         self.stopping = threading.Event()

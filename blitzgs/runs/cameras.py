@@ -54,9 +54,8 @@ class RunCameras:
     inputs: list[Path]  # paths of the photographs and masks during training
 
     def __repr__(self) -> str:
-        return (
-            f"RunCameras({len(self.cameras):,} cameras: {len(self.train):,} train, {len(self.test):,} test)"
-        )
+        parts = f"{len(self.train):,} train, {len(self.test):,} test"
+        return f"RunCameras({len(self.cameras):,} cameras: {parts})"
 
 
 def checked_camera(
@@ -110,9 +109,8 @@ def _matrix(argument: str, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
     try:
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise TypeError(
-            f"{argument} must be a matrix of numbers, got {type(value).__name__} ({error})"
-        ) from error
+        kind = type(value).__name__
+        raise TypeError(f"{argument} must be a matrix of numbers, got {kind} ({error})") from error
 
 
 def save_cameras(folder: Path, capture: Capture, run_id: str = "") -> None:

@@ -92,9 +92,7 @@ def load_lpips(path: str | None) -> Lpips | None:
     try:
         return None if path is None else torch.jit.load(path, map_location="cpu")
     except (RuntimeError, ValueError) as error:
-        raise ValueError(
-            f"{path} is not a readable TorchScript module of LPIPS (--lpips): {error}"
-        ) from error
+        raise ValueError(f"{path} is no readable TorchScript module of LPIPS (--lpips): {error}") from error
 
 
 def render_view(
@@ -211,9 +209,8 @@ def evaluate(
     if folder is not None and ranks.rank == 0:
         write(folder / "metrics.json", json.dumps(result, indent=1).encode())
     if previews is not None:
-        psnr = {
-            i: result["views"][cameras[i].name]["psnr"] for i in indices if cameras[i].name in result["views"]
-        }
+        measured = result["views"]
+        psnr = {i: measured[cameras[i].name]["psnr"] for i in indices if cameras[i].name in measured}
         for path, content in previews.files(psnr, ranks.rank == 0):
             write(path, content)
     return result

@@ -18,11 +18,9 @@ from blitzgs.view.levels import FOOTPRINT_LEVELS, footprint_levels, footprint_si
 
 
 def follow_schedule(state: TrainingState, begin: int) -> None:
-    """Open the LOD gate, if the step at [begin, begin + B) is the first that has it.
+    """Open the LOD gate, if the step at [begin, begin + B) is the first that has it. Collective.
 
     With `view.footprint`, levels follow opacities and scales (`Schedule.has_new_levels`).
-
-    Collective: every rank calls this before every step.
     """
     view = state.config.view
     # A Gaussian that is left out gathers no gradients for density control.
@@ -53,9 +51,8 @@ def follow_footprints(state: TrainingState) -> None:
 def choose_views(state: TrainingState) -> None:
     """If the LOD gate is open, choose the training views in which it leaves out enough to pay. Collective.
 
-    The choice holds until an importance pass prunes Gaussians. It is saved with
-    the checkpoints: a resumed run has other Gaussians than at the time of the choice, and might choose
-    other views.
+    The choice holds until an importance pass prunes Gaussians. It is saved with the checkpoints: a resumed
+    run has other Gaussians than at the time of the choice, and might choose other views.
     """
     if state.progress.finest_level is None:
         return

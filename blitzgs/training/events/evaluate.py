@@ -39,10 +39,8 @@ def evaluate_held_out(state: TrainingState, event: Event | None = None) -> dict[
             metrics = measure(state, capture.test or capture.train, folder)
             if event is None and capture.test:
                 cost = max(1e-9, (state.clock() - begin) / len(capture.test))
-                count = int(
-                    min(MOST_TRAINED, max(LEAST_TRAINED, TRAINED_SHARE * state.progress.seconds / cost))
-                )
-                count = state.ranks.broadcast_object(count)
+                affordable = max(LEAST_TRAINED, TRAINED_SHARE * state.progress.seconds / cost)
+                count = state.ranks.broadcast_object(int(min(MOST_TRAINED, affordable)))
                 _write_trained(state, evenly_ordered(capture.train)[:count], folder)
         except EvaluationStoppedError:
             text = "evaluation given up: the run has to stop"
