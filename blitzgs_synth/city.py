@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from blitzgs_synth import buildings
@@ -79,11 +81,8 @@ def _houses(b: MeshBuilder, plan: Plan, i: int, j: int, rng: Rng) -> None:
         south = y0 == plan.block(i, j)[1]
         front = (x0, y0, x1, y0 + 0.62 * (y1 - y0)) if south else (x0, y1 - 0.62 * (y1 - y0), x1, y1)
         body = buildings.family_house(b, front, rng)
-        garden = (
-            (x0 + 1.5, body[3] + 2, x1 - 1.5, y1 - 1.5)
-            if south
-            else (x0 + 1.5, y0 + 1.5, x1 - 1.5, body[1] - 2)
-        )
+        low, high = (body[3] + 2, y1 - 1.5) if south else (y0 + 1.5, body[1] - 2)
+        garden = (x0 + 1.5, low, x1 - 1.5, high)
         buildings.trees(b, garden, int(rng.integers(1, 4)), (3.5, 7.5), rng)
         if rng.random() < 0.7:
             buildings.hedge(b, x0, y0 + 1, x0, y1 - 1, rng)
@@ -108,10 +107,9 @@ def _line_streets(b: MeshBuilder, streets: Streets, across: Streets, rng: Rng, *
         return (float(along), across) if along_x else (across, float(along))
 
     crossings = list(zip(across.centres.tolist(), across.halves.tolist(), strict=True))
-    for centre, half, main in zip(
-        streets.centres.tolist(), streets.halves.tolist(), streets.main.tolist(), strict=True
-    ):
-        for (low, low_half), (high, high_half) in zip(crossings[:-1], crossings[1:], strict=True):
+    columns = (column.tolist() for column in (streets.centres, streets.halves, streets.main))
+    for centre, half, main in zip(*columns, strict=True):
+        for (low, low_half), (high, high_half) in itertools.pairwise(crossings):
             begin, end = low + low_half + 6, high - high_half - 6
             for side in (-1, 1):
                 for along in np.arange(begin, end, 5.6):

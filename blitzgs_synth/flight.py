@@ -90,7 +90,6 @@ def plan_flight(options: CityOptions) -> list[View]:
 
 
 def _shares(count: int, altitudes: int) -> list[int]:
-    """Divide `count` views over the altitudes, the lowest first."""
     weights = CLIMB ** (-2.0 * np.arange(altitudes))
     ends = np.rint(count * np.cumsum(weights) / weights.sum()).astype(int)
     return [int(share) for share in np.diff(ends, prepend=0)]

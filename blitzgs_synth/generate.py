@@ -122,9 +122,8 @@ def _reusable(out: Path, options: CityOptions, overwrite: bool) -> bool:
     if not different:
         return True
     if not overwrite:
-        raise FileExistsError(
-            f"{out} holds another city ({'; '.join(different)}); choose another folder, or --overwrite it"
-        )
+        what = f"holds another city ({'; '.join(different)})"
+        raise FileExistsError(f"{out} {what}; choose another folder, or --overwrite it")
     # Its folders are replaced as a whole, so they must have no other files.
     sparse = out / "sparse" / "0"
     own = {sparse / f"{name}.bin" for name in FILES}
@@ -207,7 +206,6 @@ def colmap_model(views: list[View], cloud: Cloud) -> ColmapModel:
 
 
 def _mean_errors(views: list[View], cloud: Cloud, starts: Ints, lengths: Ints) -> Doubles:
-    """Return the mean reprojection error of each point in pixels, [M]."""
     errors = np.empty(len(cloud.views))
     for i, view in enumerate(views):
         rows = slice(starts[i], starts[i + 1])
@@ -228,9 +226,8 @@ out DIR  folder to create; if it has a part of the same city, only the rest is m
 
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command `blitzgs synth`."""
-    parser = add_command(
-        commands, "synth", run, summary, None, ARGUMENTS, {"--processes": int}, preset="demo"
-    )
+    types = {"--processes": int}
+    parser = add_command(commands, "synth", run, summary, None, ARGUMENTS, types, preset="demo")
     for field in fields(CityOptions):
         flag, kind = f"--{field.name.replace('_', '-')}", type(field.default)
         how: dict[str, Any] = {"type": kind, "metavar": "N" if kind is int else "X"}

@@ -129,7 +129,6 @@ def _markings(
 
 
 def _pavement(noise: Noise, x: Floats, y: Floats, edge: Floats, footprint: Floats) -> Floats:
-    """Return paving slabs behind a lighter kerb, with a dark gutter."""
     tone = noise.layers(x, y, footprint, (5.0, 0.06), (1.2, 0.06), (0.3, 0.04))
     slab = (cell_random(np.floor(x / 0.8), np.floor(y / 0.8), 5) - 0.5) * 0.2 * resolved(0.8, footprint)
     color = rgb(0.40, 0.385, 0.36) * (1 + tone + slab)
@@ -172,7 +171,6 @@ def _park(noise: Noise, plan: Plan, x: Floats, y: Floats, i: Ints, j: Ints, foot
 
 
 def _garden(noise: Noise, x: Floats, y: Floats, edge: Floats, footprint: Floats) -> Floats:
-    """Return lawns with beds, terraces and drives."""
     color = _grass(noise, x, y, footprint, 0.06)
     cell_x, cell_y = np.floor(x / 7.3), np.floor(y / 6.1)
     chance = cell_random(cell_x, cell_y, 17)
@@ -201,7 +199,6 @@ def _square(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
 
 
 def _courtyard(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
-    """Return yards between houses: concrete and cobbles with overgrown corners."""
     tone = noise.layers(x, y, footprint, (4.0, 0.12), (1.0, 0.08), (0.3, 0.08))
     cobble = (cell_random(np.floor(x / 0.5), np.floor(y / 0.5), 29) - 0.5) * 0.35 * resolved(0.5, footprint)
     color = rgb(0.31, 0.29, 0.26) * (1 + tone + cobble)

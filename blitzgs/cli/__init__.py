@@ -109,7 +109,6 @@ def _run(given: list[str]) -> int:
 
 
 def _arguments(parser: Parser, chosen: str, given: list[str]) -> argparse.Namespace:
-    """Parse the command line; exit with status 2 if it is wrong."""
     args, unknown = parser.parse_known_args(given)
     parser_of = getattr(args, "parser", parser)
     if chosen == "train":

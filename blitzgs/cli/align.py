@@ -149,7 +149,6 @@ def _by_gps(args: argparse.Namespace, capture: Capture) -> WorldFrame:
 
 
 def _centres(capture: Capture) -> Float64:
-    """Return the positions of the cameras in the capture's own world, [V, 3]."""
     poses = np.stack([camera.world_to_camera for camera in capture.cameras])
     return camera_centres(poses) + capture.offset
 

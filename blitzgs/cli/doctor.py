@@ -252,7 +252,6 @@ def _nvcc() -> dict[str, Any]:
 
 
 def _exchange(device: str) -> dict[str, Any]:
-    """Let two processes render together."""
     port = _free_port()
     with ThreadPoolExecutor(2) as pool:
         parts = list(pool.map(lambda rank: probe("exchange", device, rank, port), "01"))

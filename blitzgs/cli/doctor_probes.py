@@ -217,7 +217,6 @@ def _camera(number: int) -> tuple[Tensor, Tensor]:
 
 
 def _rendered(scene: list[Tensor], viewmat: Tensor, K: Tensor, distributed: bool) -> Tensor:
-    """Return an image [1, H, W, 3]."""
     import blitzgs
 
     render: Any = blitzgs.rasterization

@@ -146,7 +146,6 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _refuse(args: argparse.Namespace, flags: Iterable[str], reason: str) -> None:
-    """Raise an error if one of some flags is given."""
     for flag in flags:
         if getattr(args, flag):
             raise ValueError(f"--{flag.replace('_', '-')} {reason}")
@@ -272,9 +271,8 @@ def _export_run(
         if coordinates == "world":
             frame = load_world_frame(run_folder)
             if frame is None:
-                raise FileNotFoundError(
-                    f"{run_folder} has no geo.json, so its place in the world is unknown: use blitzgs align"
-                )
+                lacks = "has no geo.json, so its place in the world is unknown"
+                raise FileNotFoundError(f"{run_folder} {lacks}: use blitzgs align")
             model, crs, coordinates = in_world(model, frame), frame.crs, "auto"
     source = Selected(source_of(model), selection or Selection(), model.space.offset, kept, score)
     return source, export(source, model.space, kind, path, coordinates, crs)
@@ -336,7 +334,6 @@ def _levels(text: str) -> tuple[int, int]:
 
 
 def _explain(exported: Exported, antialiased: bool, kind: Format, args: argparse.Namespace) -> None:
-    """Print what a user of the file must know: offset, rounding, antialiasing."""
     if exported.offset is not None:
         x, y, z = exported.offset
         print(f"coordinates are relative to ({x!r}, {y!r}, {z!r}), as {exported.sidecar} says")

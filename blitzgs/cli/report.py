@@ -22,9 +22,8 @@ for example after blitzgs eval.
 
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    add_command(
-        commands, "report", run, summary, HELP, f"{RUN}--out FILE  the file (default: RUN/report.html)"
-    )
+    text = f"{RUN}--out FILE  the file (default: RUN/report.html)"
+    add_command(commands, "report", run, summary, HELP, text)
 
 
 def run(args: argparse.Namespace) -> None:

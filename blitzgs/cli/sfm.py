@@ -121,9 +121,8 @@ def _photographs_alone(config: Config) -> Path | None:
     if not config.data.path or not has_photographs_alone(root, config.data.images):
         return None
     if (root / CONFIG).is_file():
-        raise FileNotFoundError(
-            f"{root} is a run and no capture: name the capture that its {CONFIG} has as data.path"
-        )
+        text = f"name the capture that its {CONFIG} has as data.path"
+        raise FileNotFoundError(f"{root} is a run and no capture: {text}")
     if find_models(root.parent) or find_transforms(root.parent):
         raise FileNotFoundError(
             f"{root} lies in a capture that has its cameras: --data={shlex.quote(str(root.parent))} (or find "

@@ -109,9 +109,8 @@ ARGUMENTS = f"""{DEVICES}
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
     types: Types = {"--extend": _EXTENSION, "--minutes": float, "--viewer": int}
-    parser = add_command(
-        commands, "train", run, summary, HELP, ARGUMENTS, types, False, device="auto", viewer_host="127.0.0.1"
-    )
+    parser = add_command(commands, "train", run, summary, HELP, ARGUMENTS, types, add_help=False)
+    parser.set_defaults(device="auto", viewer_host="127.0.0.1")
     parser.add_argument(
         "-h",
         "--help",

@@ -35,7 +35,6 @@ class Share:
     share: float
 
     def __repr__(self) -> str:
-        """Name both in messages."""
         return f"{self.share:g} times {self.field}"
 
 

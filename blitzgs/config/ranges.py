@@ -83,7 +83,6 @@ def problems(config: Config) -> Iterator[str]:
 
 
 def _numbers(value: Any) -> list[Any]:
-    """Return the values of nested tuples."""
     return [number for part in value for number in _numbers(part)] if isinstance(value, tuple) else [value]
 
 
@@ -184,7 +183,6 @@ def _section(section: str) -> str:
 
 
 def _about(section: str) -> str:
-    """Return what the docstring of a section says before its fields."""
     return (inspect.getdoc(_SECTIONS[section]) or "").partition("\nAttributes:")[0].strip()
 
 

@@ -137,9 +137,8 @@ class Ranks:
         # The libraries' own timeouts name only a socket or an operation. The watchdog's timeout is shorter:
         # it names a rank, and it waits for ranks that are busy on their host.
         margin = 2.0 * Watchdog.period_for(self.timeout_seconds) + 10.0
-        dist.distributed_c10d._set_pg_timeout(
-            timedelta(seconds=max(self.timeout_seconds, BUSY_SECONDS) + margin), dist.group.WORLD
-        )
+        longest = timedelta(seconds=max(self.timeout_seconds, BUSY_SECONDS) + margin)
+        dist.distributed_c10d._set_pg_timeout(longest, dist.group.WORLD)
         self.watchdog = Watchdog(self.rank, self.world_size, self.timeout_seconds)
         lap("processes")
         self._choose_transport(transport, self.timeout_seconds + margin)

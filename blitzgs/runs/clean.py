@@ -98,7 +98,6 @@ def _rows(model: Model, rows: Tensor) -> Model:
 
 
 def _psnr(model: Model, cameras: RunCameras, photograph: Callable[[int], npt.NDArray[np.uint8]]) -> float:
-    """Return the mean PSNR of the held-out views."""
     views = ((model.render(cameras.cameras[i]).cpu(), torch.from_numpy(photograph(i))) for i in cameras.test)
     return fmean(image_metrics(render, target, None)["psnr"] for render, target in views)
 

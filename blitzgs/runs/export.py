@@ -127,7 +127,8 @@ def _write(
     lines = [line for line in source.comments if offset_of([line]) == (0, 0, 0)]
     if offset is not None:
         if os.path.lexists(sidecar) and stated_offset(sidecar) is None:
-            raise FileExistsError(f"{sidecar} exists and is no offset of a model: choose another name")
+            text = "exists and is not the offset of an exported model"
+            raise FileExistsError(f"{sidecar} {text}: choose another name")
         lines.append(offset_line(offset))
     step = torch.from_numpy(shift)
 

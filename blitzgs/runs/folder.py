@@ -99,9 +99,8 @@ class Model:
             NotEnoughMemoryError: the image does not fit into memory.
         """
         camera = self._camera(camera)
-        images, alphas, _ = self._kept(camera).splat(
-            [camera], antialiased=self.config.model.antialiased, render_mode=render_mode
-        )
+        kept, antialiased = self._kept(camera), self.config.model.antialiased
+        images, alphas, _ = kept.splat([camera], antialiased, render_mode)
         if "D" in render_mode:
             images[..., -1] *= self.space.unit
         return torch.cat([images[0], alphas[0]], dim=-1) if alpha else images[0]

@@ -120,9 +120,8 @@ def bad_column(table: GaussianTable, names: Iterable[str] = PARAMETERS) -> str |
 def check_table(table: GaussianTable, step: int, names: Iterable[str] = PARAMETERS) -> None:
     """Check parameters of this rank's Gaussians (NonFiniteError: names step, column and Gaussians)."""
     if (culprit := bad_column(table, names)) is not None:
-        raise NonFiniteError(
-            f"step {step}: {culprit}. Lower the learning rates (optimiser.*) or resume from a checkpoint"
-        )
+        remedy = "Lower the learning rates (optimiser.*) or resume from a checkpoint"
+        raise NonFiniteError(f"step {step}: {culprit}. {remedy}")
 
 
 def check_before_saving(table: GaussianTable, step: int, ranks: Ranks) -> None:

@@ -195,7 +195,6 @@ class RunLog:
                 self._waiting.popleft()
 
     def _draw(self, t: int, values: Mapping[str, float]) -> None:
-        """Add numbers to TensorBoard's events."""
         # Where the log file has no space, each writer's thread would end with a traceback on the terminal.
         if self._board is None or self._waiting:
             return

@@ -63,15 +63,10 @@ class Spawns:
         """When they were born, images."""
         return self.features[:, FEATURES.index("time")]
 
-    def only(self, rows: NDArray[np.bool_]) -> Spawns:
+    def only(self, rows: NDArray[Any]) -> Spawns:
         """Return some of the spawns."""
-        return dataclasses.replace(
-            self,
-            features=self.features[rows],
-            survived=self.survived[rows],
-            parents=self.parents[rows],
-            positions=self.positions[rows],
-        )
+        columns = ("features", "survived", "parents", "positions")
+        return dataclasses.replace(self, **{name: getattr(self, name)[rows] for name in columns})
 
 
 def read_spawns(folder: Path, gaussians: int | None = None) -> Spawns:
@@ -189,8 +184,7 @@ def fit(runs: Sequence[Spawns], path: Path, gate_from: float = 0.0) -> dict[str,
         figures.append(judge(held_out, scores, gate_from))
     protocol = "leave one scene out" if several else "a quarter of the parents held out"
     result = {"protocol": protocol, "held_out": figures}
-    booster = _train(xgboost, runs)
-    write_file(path, bytes(booster.save_raw("json")))
+    write_file(path, bytes(_train(xgboost, runs).save_raw("json")))
     write_info(path, GateInfo(FEATURES, runs[0].schedule, {run.name: run.scene for run in runs}, auc=result))
     return result
 
@@ -218,13 +212,11 @@ def judge(run: Spawns, scores: NDArray[Any], gate_from: float = 0.0) -> dict[str
 
 
 def _check_same_schedule(runs: Sequence[Spawns]) -> None:
-    """Check that all runs have the schedule of the first; the message names the fields that differ."""
     first = runs[0]
     for run in runs[1:]:
         fields = sorted(first.schedule.keys() | run.schedule.keys())
         pairs = [(name, first.schedule.get(name), run.schedule.get(name)) for name in fields]
-        differing = [f"{name} ({mine!r} and {other!r})" for name, mine, other in pairs if mine != other]
-        if differing:
+        if differing := [f"{name} ({mine!r} and {other!r})" for name, mine, other in pairs if mine != other]:
             raise ValueError(
                 f"{first.name} and {run.name} were trained with different schedules, and need a gate each: "
                 + ", ".join(differing)
@@ -233,14 +225,16 @@ def _check_same_schedule(runs: Sequence[Spawns]) -> None:
 
 def _train(xgboost: ModuleType, runs: Sequence[Spawns]) -> Any:
     generator = np.random.default_rng(0)
-    features, labels = [], []
-    for run in runs:
-        rows: Any = slice(None)
-        if len(run.survived) > MAX_ROWS:
-            rows = np.sort(generator.choice(len(run.survived), MAX_ROWS, replace=False))
-        features.append(run.features[rows])
-        labels.append(run.survived[rows])
-    data = xgboost.DMatrix(np.concatenate(features), np.concatenate(labels), feature_names=list(FEATURES))
+
+    def drawn(run: Spawns) -> Spawns:
+        if len(run.survived) <= MAX_ROWS:
+            return run
+        return run.only(np.sort(generator.choice(len(run.survived), MAX_ROWS, replace=False)))
+
+    parts = list(map(drawn, runs))
+    features = np.concatenate([part.features for part in parts])
+    labels = np.concatenate([part.survived for part in parts])
+    data = xgboost.DMatrix(features, labels, feature_names=list(FEATURES))
     # A row's weight in a leaf is p (1 - p), at most 1/4.
     least = {"min_child_weight": LEAF_SHARE * data.num_row() / 4}
     return xgboost.train(XGBOOST_PARAMETERS | least | {"seed": 0}, data, ROUNDS)

@@ -283,7 +283,8 @@ def read_lineage(folder: Path) -> dict[str, dict[str, Any]]:
         found = (path for path in folder.glob(f"{table}_*.parquet") if PART_NAME.fullmatch(path.name))
         paths = sorted(path for path in found if path.is_file())
         if not paths and table == "births":
-            raise FileNotFoundError(f"{folder} holds no lineage: --population.lineage=true logs it")
+            remedy = "train with --population.lineage=true to log it"
+            raise FileNotFoundError(f"{folder} holds no lineage: {remedy}")
         # A log of an older version lacks some of the features.
         needed = [name for group in TABLES[table] for name in group if name not in FEATURES]
         parts = [read_numbers(path) for path in paths]

@@ -118,9 +118,8 @@ def measure_step(state: TrainingState, frame: Frame, batch: Batch) -> HostCopy:
     loss, extent, table = state.config.loss, state.space.extent, state.stepper.table
     assert frame.active is not None  # as in every step of a training
     active = frame.active.considered()
-    visible, population = (
-        active.new_full((), count) for count in (len(frame.projected.visible_ids), len(state.table))
-    )
+    numbers = len(frame.projected.visible_ids), len(state.table)
+    visible, population = (active.new_full((), number) for number in numbers)
     counts = state.ranks.all_reduce(torch.stack([find_bad(table), active, visible, population]))
     scale = opacity = batch.samples.new_zeros(())
     if loss.scale > 0:

@@ -243,7 +243,6 @@ def _branch(point: Path, folder: Path) -> None:
 
 
 def _check_comparable(config: Config, capture: Capture, images: ImageStore, source: Path) -> None:
-    """Check that arms can be branched from a run and that their results can be compared."""
     if not config.population.lineage:
         raise ValueError(f"{source} was trained without --population.lineage=true: nothing can be branched")
     if config.population.strategy == "relocation":

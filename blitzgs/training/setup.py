@@ -273,7 +273,6 @@ def _start_lineage(
 
 
 def _origin(restored: TrainedModel | None, resume: bool, folder: Path, schedule: Schedule) -> str:
-    """Describe where the run begins, for the log."""
     if restored is not None:
         more = ""
         if Schedule(restored.config.schedule).iterations != schedule.iterations:

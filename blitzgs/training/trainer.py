@@ -277,7 +277,6 @@ class Trainer:
         density_stats_(*statistics, *of_splats, views.width, views.height, float(len(views)), phi)
 
     def _announce(self) -> None:
-        """Log the start of the training: origin, population, views and ranks."""
         state, ranks = self.state, self.state.ranks
         views = {"train": len(state.capture.train), "test": len(state.capture.test)}
         images = state.schedule.iterations

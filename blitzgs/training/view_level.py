@@ -41,9 +41,8 @@ def follow_footprints(state: TrainingState) -> None:
     # In no training view is a Gaussian larger than at the largest focal length.
     focal = max(float(state.capture.cameras[index].K[0, 0]) for index in state.capture.train)
     sizes = footprint_sizes(table["scales"], table["opacities"])
-    table["level"] = footprint_levels(
-        sizes, focal / config.view.footprint, state.progress.reference_distance, level_fork(config)
-    )
+    distance, fork = state.progress.reference_distance, level_fork(config)
+    table["level"] = footprint_levels(sizes, focal / config.view.footprint, distance, fork)
     state.progress.level_count = FOOTPRINT_LEVELS
     state.stepper.reindex()
 

@@ -60,7 +60,6 @@ def run_importance_pass(state: TrainingState, event: Event) -> None:
 
 
 def _surveyed(state: TrainingState, views: int) -> Importance:
-    """Survey all training views. Collective."""
     subject, rule = state.subject(), state.config.population.score
     with state.log.work("views surveyed") as report:
         batches = _reported(view_batches(state), report, views)
