@@ -110,6 +110,7 @@ class Agreement:
         self._last: tuple[int, float] | None = None
         # The requests of all ranks and the step after which they were collected, until they are read.
         self._asked: tuple[int, HostCopy] | None = None
+        self._reads_late = ranks.device.type == "cuda"
         self._agreed_to_stop = False
 
     def after(self, step: int, lost: bool = False) -> Decision:
@@ -123,7 +124,7 @@ class Agreement:
             if step < self._next:
                 return Decision()
             self._asked = self._ask(step, lost)
-            if self._ranks.device.type == "cuda":  # the host reads late
+            if self._reads_late:
                 return Decision()
         return self._answer(step, *self._asked)
 
