@@ -52,7 +52,7 @@ class View:
 
 def flight_height(options: CityOptions) -> float:
     """Return the lowest height above ground, in metres, at which nadir images have the wanted overlap."""
-    nadir = max(_shares(options.views - _oblique_count(options), options.altitudes)[0], 1)
+    nadir = max(_shares(options.views - round(options.oblique * options.views), options.altitudes)[0], 1)
     spacing = options.extent / math.sqrt(nadir)
     footprint = spacing / (1 - OVERLAP)
     side = math.sqrt(options.width * options.height) / options.width  # of the image, mean of both edges
@@ -66,9 +66,9 @@ def plan_flight(options: CityOptions) -> list[View]:
     """
     rng = np.random.default_rng([options.seed, 4])
     lowest, focal = flight_height(options), 0.5 * options.width / math.tan(FIELD_OF_VIEW / 2)
-    oblique = _oblique_count(options)
+    oblique = round(options.oblique * options.views)
     per_heading = [oblique // 4 + (k < oblique % 4) for k in range(4)]
-    passes: list[tuple[str, float, float, int]] = [("nadir", 0.0, 0.0, options.views - oblique)]
+    passes = [("nadir", 0.0, 0.0, options.views - oblique)]
     passes += [(f"oblique_{'nesw'[k]}", k * math.pi / 2, TILT, n) for k, n in enumerate(per_heading)]
     views: list[View] = []
     for label, heading, tilt, total in passes:
@@ -93,10 +93,6 @@ def _shares(count: int, altitudes: int) -> list[int]:
     weights = CLIMB ** (-2.0 * np.arange(altitudes))
     ends = np.rint(count * np.cumsum(weights) / weights.sum()).astype(int)
     return [int(share) for share in np.diff(ends, prepend=0)]
-
-
-def _oblique_count(options: CityOptions) -> int:
-    return round(options.oblique * options.views)
 
 
 def _lawn_mower(count: int, extent: float) -> list[Doubles]:

@@ -15,6 +15,7 @@ from blitzgs_synth.plan import (
     RETAIL,
     SIDEWALK,
     TOWERS,
+    URBAN,
     Bools,
     Doubles,
     Floats,
@@ -43,12 +44,10 @@ def ground_color(plan: Plan, noise: Noise, position: Floats, footprint: Floats, 
     in_city_y = (y > plan.along_x.centres[0] - 8) & (y < plan.along_x.centres[-1] + 8)
     edge_x = np.abs(dx) - plan.along_y.halves[i]  # below 0 on a street along y
     edge_y = np.abs(dy) - plan.along_x.halves[j]
-    has_x = in_city_y | plan.along_y.main[i]
-    has_y = in_city_x | plan.along_x.main[j]
-    edge_x = np.where(has_x & (in_city_x | plan.along_y.main[i]), edge_x, np.float32(1e3))
-    edge_y = np.where(has_y & (in_city_y | plan.along_x.main[j]), edge_y, np.float32(1e3))
-    edge = np.minimum(edge_x, edge_y)
     inside_city = in_city_x & in_city_y
+    edge_x = np.where(inside_city | plan.along_y.main[i], edge_x, np.float32(1e3))
+    edge_y = np.where(inside_city | plan.along_x.main[j], edge_y, np.float32(1e3))
+    edge = np.minimum(edge_x, edge_y)
 
     def fill(mask: Bools, paint: object, *arguments: object) -> None:
         chosen = np.flatnonzero(mask)
@@ -64,13 +63,12 @@ def ground_color(plan: Plan, noise: Noise, position: Floats, footprint: Floats, 
     block_j = np.clip(j - (dy <= 0), 0, plan.kinds.shape[1] - 1)
     kind = plan.kinds[block_i, block_j]
     beyond = (np.abs(x) > plan.half) | (np.abs(y) > plan.half)
-    park, houses, square = kind == PARK, kind == HOUSES, (kind == PLAZA) | (kind == TOWERS)
-    fill(interior & park & ~beyond, _park, plan, x, y, block_i, block_j, footprint)
-    fill(interior & houses & ~beyond, _garden, x, y, edge, footprint)
-    fill(interior & square & ~beyond, _square, x, y, footprint)
-    fill(interior & (kind == RETAIL) & ~beyond, _car_park, plan, x, y, block_i, block_j, footprint)
-    rest = interior & ~park & ~houses & ~square & (kind != RETAIL)
-    fill(rest & ~beyond, _courtyard, x, y, footprint)
+    block = interior & ~beyond
+    fill(block & (kind == PARK), _park, plan, x, y, block_i, block_j, footprint)
+    fill(block & (kind == HOUSES), _garden, x, y, edge, footprint)
+    fill(block & ((kind == PLAZA) | (kind == TOWERS)), _square, x, y, footprint)
+    fill(block & (kind == RETAIL), _car_park, plan, x, y, block_i, block_j, footprint)
+    fill(block & (kind == URBAN), _courtyard, x, y, footprint)
     fill((interior & beyond) | (~street & ~inside_city), _fields, x, y, footprint)
     return color
 
