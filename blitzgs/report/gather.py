@@ -57,11 +57,6 @@ class RunData:
         """The numbers of the summary."""
         return {name: value for name, value in self.summary.items() if isinstance(value, (int, float))}
 
-    @property
-    def is_test(self) -> bool:
-        """Whether the measured views are held out."""
-        return self.cameras is None or bool(self.cameras.test)
-
 
 def read_run(path: Path) -> RunData:
     """Read a run (FileNotFoundError: it is none); damaged files are left out, and named in `problems`."""

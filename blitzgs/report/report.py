@@ -100,7 +100,7 @@ def report(folder: Path, look: Look = None) -> str:
         "name": folder.resolve().name,
         "subtitle": gather.subtitle(data),
         "summary": data.figures,
-        "split": "test" if data.is_test else "train",
+        "split": "test" if data.cameras is None or data.cameras.test else "train",
         "metrics": metrics,
         "views": list(gather.rows_of(data.views, metrics)),
         "pictures": _pictures(data),
