@@ -92,7 +92,7 @@ def load_lpips(path: str | None) -> Lpips | None:
     try:
         return None if path is None else torch.jit.load(path, map_location="cpu")
     except (RuntimeError, ValueError) as error:
-        raise ValueError(f"{path} is no readable TorchScript module of LPIPS (--lpips): {error}") from error
+        raise ValueError(f"{path} is not readable TorchScript of LPIPS (--lpips): {error}") from error
 
 
 def render_view(
