@@ -7,7 +7,7 @@ painted by procedural materials (`materials`, `ground`), photographed with Embre
 (`tracks`, `generate`).
 """
 
-from blitzgs_synth.generate import add_arguments, generate_city, run
+from blitzgs_synth.generate import generate_city
 from blitzgs_synth.plan import PRESETS, CityOptions
 
-__all__ = ["PRESETS", "CityOptions", "add_arguments", "generate_city", "run"]
+__all__ = ["PRESETS", "CityOptions", "generate_city"]

@@ -31,30 +31,18 @@ FLOOR: Final = 3.1  # metres from one floor to the next
 PLASTER, BRICK, BANDED = 0.0, 1.0, 2.0
 
 _WALLS: Final[list[Color]] = [
-    (0.72, 0.62, 0.45),
-    (0.78, 0.74, 0.66),
-    (0.68, 0.48, 0.33),
-    (0.62, 0.66, 0.62),
-    (0.75, 0.55, 0.42),
-    (0.80, 0.70, 0.48),
-    (0.55, 0.57, 0.60),
-    (0.70, 0.42, 0.32),
-]
+    (0.72, 0.62, 0.45), (0.78, 0.74, 0.66), (0.68, 0.48, 0.33), (0.62, 0.66, 0.62),
+    (0.75, 0.55, 0.42), (0.80, 0.70, 0.48), (0.55, 0.57, 0.60), (0.70, 0.42, 0.32),
+]  # fmt: skip
 _BRICKS: Final[list[Color]] = [(0.42, 0.18, 0.12), (0.50, 0.26, 0.17), (0.36, 0.22, 0.17)]
 _CONCRETES: Final[list[Color]] = [(0.55, 0.54, 0.51), (0.66, 0.64, 0.60), (0.44, 0.45, 0.46)]
 _ROOF_TILES: Final[list[Color]] = [
-    (0.46, 0.17, 0.09),
-    (0.40, 0.20, 0.13),
-    (0.52, 0.24, 0.12),
-    (0.20, 0.20, 0.22),
+    (0.46, 0.17, 0.09), (0.40, 0.20, 0.13), (0.52, 0.24, 0.12), (0.20, 0.20, 0.22),
     (0.30, 0.17, 0.13),
-]
+]  # fmt: skip
 _ROOF_FLATS: Final[list[Color]] = [
-    (0.42, 0.41, 0.39),
-    (0.30, 0.30, 0.31),
-    (0.52, 0.50, 0.46),
-    (0.36, 0.33, 0.30),
-]
+    (0.42, 0.41, 0.39), (0.30, 0.30, 0.31), (0.52, 0.50, 0.46), (0.36, 0.33, 0.30),
+]  # fmt: skip
 CONCRETE: Final = Look(PLAIN, (0.52, 0.51, 0.48))
 STEEL: Final = Look(METAL, (0.56, 0.58, 0.60))
 
@@ -80,13 +68,10 @@ def flat_roof(b: MeshBuilder, x0: float, y0: float, x1: float, y1: float, z: flo
     gravel = Look(GRAVEL, _pick(_ROOF_FLATS, rng), _seed(rng))
     b.top(x0, y0, x1, y1, z, gravel)
     t, rim = 0.3, z + float(rng.uniform(0.4, 0.9))
-    for ax, ay, bx, by in (
-        (x0, y0, x1, y0 + t),
-        (x0, y1 - t, x1, y1),
-        (x0, y0 + t, x0 + t, y1 - t),
-        (x1 - t, y0 + t, x1, y1 - t),
-    ):
-        b.box(ax, ay, bx, by, z, rim, CONCRETE, CONCRETE)
+    for edge in (
+        (x0, y0, x1, y0 + t), (x0, y1 - t, x1, y1), (x0, y0 + t, x0 + t, y1 - t), (x1 - t, y0 + t, x1, y1 - t)
+    ):  # fmt: skip
+        b.box(*edge, z, rim, CONCRETE, CONCRETE)
     width, depth = x1 - x0 - 2.0, y1 - y0 - 2.0
     if min(width, depth) < 4:
         return
@@ -149,7 +134,6 @@ def gable_roof(
 
 
 def _balconies(b: MeshBuilder, rectangle: Rectangle, floors: int, rng: Rng) -> None:
-    """Add slabs with parapets on the south and north walls."""
     x0, y0, x1, y1 = rectangle
     side = Look(PLAIN, (0.6, 0.6, 0.58))
     for x in np.arange(x0 + rng.uniform(0.8, 2.0), x1 - 2.4, rng.uniform(3.4, 5.5)):
@@ -181,16 +165,13 @@ def town_block(b: MeshBuilder, block: Rectangle, density: float, rng: Rng) -> Re
     def floors() -> int:
         return int(np.clip(round(rng.normal(2.6 + 2.8 * density, 0.9)), 2, 7))
 
-    for low, high, lo_y, hi_y in ((x0, x1, y0, y0 + depth), (x0, x1, y1 - depth, y1)):
-        for a, c in _lots(low, high, rng):
+    for lo_y, hi_y in ((y0, y0 + depth), (y1 - depth, y1)):
+        for a, c in _lots(x0, x1, rng):
             setback = float(rng.choice([0.0, 0.0, 0.6, 1.4]))
             south = (a, lo_y + (setback if lo_y == y0 else 0), c, hi_y - (setback if hi_y == y1 else 0))
             town_house(b, south, floors(), rng, along_x=True)
-    for low, high, lo_x, hi_x in (
-        (y0 + depth, y1 - depth, x0, x0 + depth),
-        (y0 + depth, y1 - depth, x1 - depth, x1),
-    ):
-        for a, c in _lots(low, high, rng):
+    for lo_x, hi_x in ((x0, x0 + depth), (x1 - depth, x1)):
+        for a, c in _lots(y0 + depth, y1 - depth, rng):
             if rng.random() < 0.85:
                 town_house(b, (lo_x, a, hi_x, c), floors(), rng, along_x=False)
     return (x0 + depth, y0 + depth, x1 - depth, y1 - depth)
@@ -270,23 +251,14 @@ def shops(b: MeshBuilder, block: Rectangle, rng: Rng) -> Rectangle:
 
 
 _LEAVES: Final[list[Color]] = [
-    (0.075, 0.16, 0.035),
-    (0.11, 0.19, 0.045),
-    (0.06, 0.13, 0.04),
-    (0.15, 0.20, 0.05),
+    (0.075, 0.16, 0.035), (0.11, 0.19, 0.045), (0.06, 0.13, 0.04), (0.15, 0.20, 0.05),
     (0.09, 0.15, 0.06),
-]
+]  # fmt: skip
 _BARK: Final = Look(PLAIN, (0.16, 0.11, 0.07))
 _PAINTS: Final[list[Color]] = [
-    (0.75, 0.75, 0.76),
-    (0.42, 0.43, 0.45),
-    (0.05, 0.05, 0.06),
-    (0.50, 0.04, 0.03),
-    (0.05, 0.11, 0.30),
-    (0.80, 0.79, 0.74),
-    (0.14, 0.15, 0.17),
-    (0.10, 0.20, 0.12),
-]
+    (0.75, 0.75, 0.76), (0.42, 0.43, 0.45), (0.05, 0.05, 0.06), (0.50, 0.04, 0.03),
+    (0.05, 0.11, 0.30), (0.80, 0.79, 0.74), (0.14, 0.15, 0.17), (0.10, 0.20, 0.12),
+]  # fmt: skip
 
 
 def tree(b: MeshBuilder, x: float, y: float, height: float, rng: Rng) -> None:
@@ -344,9 +316,7 @@ def car(b: MeshBuilder, x: float, y: float, rng: Rng, *, along_x: bool) -> None:
     ahead = float(rng.choice([-0.2, 0.2]))
 
     def place(l0: float, l1: float, w: float) -> Rectangle:
-        if along_x:
-            return (x + l0, y - w, x + l1, y + w)
-        return (x - w, y + l0, x + w, y + l1)
+        return (x + l0, y - w, x + l1, y + w) if along_x else (x - w, y + l0, x + w, y + l1)
 
     b.box(*place(-length / 2, length / 2, width / 2), 0.12, 0.85, paint, paint)
     b.box(*place(-0.27 * length + ahead, 0.25 * length + ahead, 0.43 * width), 0.85, 1.42, glass, paint)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from blitzgs_synth import buildings
@@ -79,11 +81,8 @@ def _houses(b: MeshBuilder, plan: Plan, i: int, j: int, rng: Rng) -> None:
         south = y0 == plan.block(i, j)[1]
         front = (x0, y0, x1, y0 + 0.62 * (y1 - y0)) if south else (x0, y1 - 0.62 * (y1 - y0), x1, y1)
         body = buildings.family_house(b, front, rng)
-        garden = (
-            (x0 + 1.5, body[3] + 2, x1 - 1.5, y1 - 1.5)
-            if south
-            else (x0 + 1.5, y0 + 1.5, x1 - 1.5, body[1] - 2)
-        )
+        low, high = (body[3] + 2, y1 - 1.5) if south else (y0 + 1.5, body[1] - 2)
+        garden = (x0 + 1.5, low, x1 - 1.5, high)
         buildings.trees(b, garden, int(rng.integers(1, 4)), (3.5, 7.5), rng)
         if rng.random() < 0.7:
             buildings.hedge(b, x0, y0 + 1, x0, y1 - 1, rng)
@@ -96,57 +95,51 @@ def _park(b: MeshBuilder, block: tuple[float, float, float, float], rng: Rng) ->
     cx, cy = (x0 + x1) / 2, (y0 + y1) / 2
     radius = 0.3 * min(x1 - x0, y1 - y0)  # the lawn and pond in the middle stay open
     buildings.kiosk(b, cx + 1.25 * radius, cy, rng)
-    for area in ((x0, y0, x1, cy - radius), (x0, cy + radius, x1, y1)):
-        x_low, y_low, x_high, y_high = area
+    for x_low, y_low, x_high, y_high in ((x0, y0, x1, cy - radius), (x0, cy + radius, x1, y1)):
         count = int((x_high - x_low) * (y_high - y_low) / 28)
         buildings.trees(b, (x_low + 1.5, y_low + 1.5, x_high - 1.5, y_high - 1.5), count, (5, 11), rng, 4.2)
 
 
 def _line_streets(b: MeshBuilder, streets: Streets, across: Streets, rng: Rng, *, along_x: bool) -> None:
     """Put parked and moving cars on the streets of one direction, and trees along the wide ones."""
+
+    def place(across: float, along: float) -> tuple[float, float]:
+        return (float(along), across) if along_x else (across, float(along))
+
     crossings = list(zip(across.centres.tolist(), across.halves.tolist(), strict=True))
-    for centre, half, main in zip(
-        streets.centres.tolist(), streets.halves.tolist(), streets.main.tolist(), strict=True
-    ):
-        for (low, low_half), (high, high_half) in zip(crossings[:-1], crossings[1:], strict=True):
+    columns = (column.tolist() for column in (streets.centres, streets.halves, streets.main))
+    for centre, half, main in zip(*columns, strict=True):
+        for (low, low_half), (high, high_half) in itertools.pairwise(crossings):
             begin, end = low + low_half + 6, high - high_half - 6
             for side in (-1, 1):
                 for along in np.arange(begin, end, 5.6):
-                    lane = side * (half - 1.15)
                     if rng.random() < 0.42:
-                        _car(b, centre + lane, float(along), rng, along_x)
-                if main and rng.random() < 0.8:
-                    _car(b, centre + side * 1.9, float(rng.uniform(begin, end)), rng, along_x)
-                if main:
-                    for along in np.arange(begin, end, 8.5):
-                        offset = centre + side * (half + 0.45 * SIDEWALK)
-                        x, y = (float(along), offset) if along_x else (offset, float(along))
-                        buildings.tree(b, x, y, float(rng.uniform(5, 7.5)), rng)
-
-
-def _car(b: MeshBuilder, across: float, along: float, rng: Rng, along_x: bool) -> None:
-    x, y = (along, across) if along_x else (across, along)
-    buildings.car(b, x, y, rng, along_x=along_x)
+                        buildings.car(b, *place(centre + side * (half - 1.15), along), rng, along_x=along_x)
+                if not main:
+                    continue
+                if rng.random() < 0.8:
+                    along = rng.uniform(begin, end)
+                    buildings.car(b, *place(centre + side * 1.9, along), rng, along_x=along_x)
+                for along in np.arange(begin, end, 8.5):
+                    spot = place(centre + side * (half + 0.45 * SIDEWALK), along)
+                    buildings.tree(b, *spot, float(rng.uniform(5, 7.5)), rng)
 
 
 def _outskirts(b: MeshBuilder, plan: Plan, rng: Rng) -> None:
     """Scatter groups of trees and a few farms around the built-up square, off the roads that leave it."""
     edge, reach = plan.half + 12, plan.half + 0.5 * plan.options.extent
     for _ in range(int(np.clip(plan.options.extent / 2.5, 40, 1500))):
-        x, y = rng.uniform(-reach, reach, 2)
-        if max(abs(x), abs(y)) < edge or not _off_roads(plan, float(x), float(y), 12):
+        x, y = rng.uniform(-reach, reach, 2).tolist()
+        if max(abs(x), abs(y)) < edge or not _off_roads(plan, x, y, 12):
             continue
         if rng.random() < 0.08:
-            buildings.family_house(b, (float(x) - 8, float(y) - 8, float(x) + 8, float(y) + 8), rng)
+            buildings.family_house(b, (x - 8, y - 8, x + 8, y + 8), rng)
             continue
-        buildings.trees(
-            b, (float(x) - 5, float(y) - 5, float(x) + 5, float(y) + 5), int(rng.integers(1, 6)), (4, 9), rng
-        )
+        buildings.trees(b, (x - 5, y - 5, x + 5, y + 5), int(rng.integers(1, 6)), (4, 9), rng)
 
 
 def _off_roads(plan: Plan, x: float, y: float, margin: float) -> bool:
-    for streets, value in ((plan.along_y, x), (plan.along_x, y)):
-        near = np.abs(streets.centres - value) < streets.halves + margin
-        if bool((near & streets.main).any()):
-            return False
-    return True
+    return not any(
+        ((np.abs(streets.centres - value) < streets.halves + margin) & streets.main).any()
+        for streets, value in ((plan.along_y, x), (plan.along_x, y))
+    )

@@ -31,8 +31,7 @@ class View:
     @property
     def translation(self) -> Doubles:
         """Return t = -R c, [3]."""
-        moved: Doubles = -self.rotation @ self.centre
-        return moved
+        return -self.rotation @ self.centre
 
     def project(self, points: Doubles) -> tuple[Doubles, Doubles]:
         """Return pixels [N, 2] and depths [N] of world points [N, 3]; pixels mean nothing at depth <= 0."""
@@ -53,7 +52,7 @@ class View:
 
 def flight_height(options: CityOptions) -> float:
     """Return the lowest height above ground, in metres, at which nadir images have the wanted overlap."""
-    nadir = max(_shares(options.views - _oblique_count(options), options.altitudes)[0], 1)
+    nadir = max(_shares(options.views - round(options.oblique * options.views), options.altitudes)[0], 1)
     spacing = options.extent / math.sqrt(nadir)
     footprint = spacing / (1 - OVERLAP)
     side = math.sqrt(options.width * options.height) / options.width  # of the image, mean of both edges
@@ -66,10 +65,10 @@ def plan_flight(options: CityOptions) -> list[View]:
     With several altitudes each of these is flown at the lowest first.
     """
     rng = np.random.default_rng([options.seed, 4])
-    lowest = flight_height(options)
-    oblique = _oblique_count(options)
+    lowest, focal = flight_height(options), 0.5 * options.width / math.tan(FIELD_OF_VIEW / 2)
+    oblique = round(options.oblique * options.views)
     per_heading = [oblique // 4 + (k < oblique % 4) for k in range(4)]
-    passes: list[tuple[str, float, float, int]] = [("nadir", 0.0, 0.0, options.views - oblique)]
+    passes = [("nadir", 0.0, 0.0, options.views - oblique)]
     passes += [(f"oblique_{'nesw'[k]}", k * math.pi / 2, TILT, n) for k, n in enumerate(per_heading)]
     views: list[View] = []
     for label, heading, tilt, total in passes:
@@ -83,30 +82,17 @@ def plan_flight(options: CityOptions) -> list[View]:
             for position in _lawn_mower(count, flown):
                 ground = position + rng.normal(0, 0.01 * height, 2)
                 centre = np.array([*(ground - back * forward), height * (1 + rng.normal(0, 0.01))])
-                yaw, pitch, roll = np.array([heading, tilt, 0.0]) + rng.normal(0, math.radians(1.2), 3)
-                focal = 0.5 * options.width / math.tan(FIELD_OF_VIEW / 2)
-                views.append(
-                    View(
-                        name=f"{len(views):05d}_{label}.jpg",
-                        width=options.width,
-                        height=options.height,
-                        focal=focal,
-                        rotation=_rotation(float(yaw), float(pitch), float(roll)),
-                        centre=centre,
-                    )
-                )
+                angles = np.array([heading, tilt, 0.0]) + rng.normal(0, math.radians(1.2), 3)
+                name = f"{len(views):05d}_{label}.jpg"
+                rotation = _rotation(*angles.tolist())
+                views.append(View(name, options.width, options.height, focal, rotation, centre))
     return views
 
 
 def _shares(count: int, altitudes: int) -> list[int]:
-    """Divide `count` views over the altitudes, the lowest first."""
     weights = CLIMB ** (-2.0 * np.arange(altitudes))
     ends = np.rint(count * np.cumsum(weights) / weights.sum()).astype(int)
     return [int(share) for share in np.diff(ends, prepend=0)]
-
-
-def _oblique_count(options: CityOptions) -> int:
-    return round(options.oblique * options.views)
 
 
 def _lawn_mower(count: int, extent: float) -> list[Doubles]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import fcntl
 import json
 import os
 import shutil
@@ -27,7 +26,8 @@ from blitzgs.capture.colmap import (
     read_model,
     write_model,
 )
-from blitzgs.util.output import PARTIAL, write_file
+from blitzgs.cli.arguments import Commands, add_command
+from blitzgs.util.output import PARTIAL, locked, write_file
 from blitzgs.util.progress import image_progress
 from blitzgs.util.rotations import quaternions
 from blitzgs_synth.flight import View, plan_flight
@@ -53,26 +53,16 @@ def generate_city(
     """Generate a city and photograph it from the air, unless `out` already holds the same one.
 
     Writes `images/*.jpg`, `sparse/0/*.bin` (a COLMAP model: PINHOLE camera, poses, points with tracks; in
-    metres, z up) and `city.json` (the parameters). The folder appears only when complete. Until then the
-    files are in `.NAME.partial` beside it, and after an interruption the same call continues there. The
-    files depend on the parameters alone, not on processes or interruptions. On another processor or with
-    other library versions, single pixels may differ by rounding.
+    metres, z up) and `city.json` (the parameters, fields of `CityOptions`). The folder appears only when
+    complete. Until then the files are in `.NAME.partial` beside it, and after an interruption the same call
+    continues there. The files depend on the parameters alone, not on processes or interruptions. On another
+    processor or with other library versions, single pixels may differ by rounding.
 
-    Args:
-        out: folder to create.
-        processes: number of processes that render; None: one for each core that this process may use.
-        overwrite: replace a city with other parameters instead of raising.
-        progress: called after each image.
-        **parameters: fields of `CityOptions`; the others have its defaults.
-
-    Returns:
-        `out`, ready to be trained on.
-
-    Raises:
-        TypeError, ValueError: a parameter is unknown, or out of range.
-        FileExistsError: `out` holds something else, or another process is making it.
-        BrokenProcessPool: the system ended one of the processes, for example because memory ran out.
-        ModuleNotFoundError: `embreex` is not installed.
+    `processes` render (None: one for each core that this process may use); `progress` is called after each
+    image. TypeError, ValueError: a parameter is unknown, or out of range. FileExistsError: `out` holds
+    something else, which `overwrite` allows of a city, or another process is making it. BrokenProcessPool:
+    the system ended one of the processes, for example because memory ran out. ImportError: `embreex` is not
+    installed.
     """
     options = CityOptions(**parameters)
     out = Path(out)
@@ -98,9 +88,7 @@ def generate_city(
 def _begun(partial: Path, options: CityOptions) -> Iterator[None]:
     """Lock the folder in which a city is made; empty it if it holds the beginning of another city."""
     partial.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(partial / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    with locked(partial / _LOCK, f"{partial}: another process is making this city; wait for it"):
         started = partial / _STARTED
         wanted = json.dumps(options.manifest(), indent=2) + "\n"
         found = started.read_text() if started.exists() else ""
@@ -112,19 +100,13 @@ def _begun(partial: Path, options: CityOptions) -> Iterator[None]:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
             write_file(started, wanted)
         yield
-    except BlockingIOError as error:
-        raise FileExistsError(f"{partial}: another process is making this city; wait for it") from error
-    finally:
-        os.close(descriptor)
 
 
 def _reusable(out: Path, options: CityOptions, overwrite: bool) -> bool:
     """Return whether `out` holds this city; raise if it holds files that must not be replaced."""
-    if not out.exists():
-        return False
-    if not out.is_dir():
+    if out.is_file():
         raise FileExistsError(f"{out} is a file; choose a folder for the city")
-    if not any(out.iterdir()):
+    if not out.exists() or not any(out.iterdir()):
         return False
     if not (out / MANIFEST).exists():
         raise FileExistsError(f"{out} has files but no generated city; choose another folder")
@@ -133,24 +115,16 @@ def _reusable(out: Path, options: CityOptions, overwrite: bool) -> bool:
         if not isinstance(found, dict):
             raise ValueError("not a JSON object")
     except (OSError, ValueError, RecursionError) as error:
-        raise FileExistsError(
-            f"{out} holds no generated city ({MANIFEST}: {error}); choose another folder"
-        ) from error
-    wanted = options.manifest()
-    different = [
-        f"{key} {found.get(key)}, not {value}" for key, value in wanted.items() if found.get(key) != value
-    ]
-    if different and not overwrite:
-        raise FileExistsError(
-            f"{out} holds another city ({'; '.join(different)}); choose another folder, or --overwrite it"
-        )
-    if different:
-        _check_no_others(out)
-    return not different
-
-
-def _check_no_others(out: Path) -> None:
-    """Check that the folders of a city, which are replaced as a whole, have no other files."""
+        what = f"holds no generated city ({MANIFEST}: {error})"
+        raise FileExistsError(f"{out} {what}; choose another folder") from error
+    pairs = [(key, found.get(key), value) for key, value in options.manifest().items()]
+    different = [f"{key} {mine}, not {wanted}" for key, mine, wanted in pairs if mine != wanted]
+    if not different:
+        return True
+    if not overwrite:
+        what = f"holds another city ({'; '.join(different)})"
+        raise FileExistsError(f"{out} {what}; choose another folder, or --overwrite it")
+    # Its folders are replaced as a whole, so they must have no other files.
     sparse = out / "sparse" / "0"
     own = {sparse / f"{name}.bin" for name in FILES}
     if all(path.is_file() for path in own):
@@ -159,6 +133,7 @@ def _check_no_others(out: Path) -> None:
         for path in sorted((out / folder).rglob("*")):
             if path not in own and not path.is_dir():
                 raise FileExistsError(f"{path} is no part of the city, and would be lost: move it elsewhere")
+    return False
 
 
 def _write(folder: Path, options: CityOptions, processes: int, progress: Progress | None) -> None:
@@ -231,54 +206,43 @@ def colmap_model(views: list[View], cloud: Cloud) -> ColmapModel:
 
 
 def _mean_errors(views: list[View], cloud: Cloud, starts: Ints, lengths: Ints) -> Doubles:
-    """Return the mean reprojection error of each point in pixels, [M]."""
     errors = np.empty(len(cloud.views))
     for i, view in enumerate(views):
         rows = slice(starts[i], starts[i + 1])
         projected, _ = view.project(cloud.positions[cloud.points[rows]])
         errors[rows] = np.linalg.norm(projected - cloud.pixels[rows], axis=1)
-    mean: Doubles = np.bincount(cloud.points, errors, len(cloud.positions)) / np.maximum(lengths, 1)
-    return mean
+    return np.bincount(cloud.points, errors, len(cloud.positions)) / np.maximum(lengths, 1)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of `blitzgs synth` to a parser."""
-    parser.add_argument(
-        "out",
-        type=Path,
-        metavar="DIR",
-        help="folder to create; if it has a part of the same city, only the rest is made",
-    )
-    sizes = (f"{name}, {o.views:,} views of {o.width} x {o.height}" for name, o in PRESETS.items())
-    parser.add_argument(
-        "--preset",
-        choices=PRESETS,
-        default="demo",
-        help=f"city that the other flags change (default: %(default)s): {'; '.join(sizes)}",
-    )
+ARGUMENTS = f"""
+out DIR  folder to create; if it has a part of the same city, only the rest is made
+--preset {"|".join(PRESETS)}  city that the other flags change (default: %(default)s): {
+    "; ".join(f"{name}, {o.views:,} views of {o.width} x {o.height}" for name, o in PRESETS.items())
+}
+--processes N  number of processes (default: one for each core)
+--overwrite  replace another generated city in this folder
+"""
+
+
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
+    """Add the command `blitzgs synth`."""
+    types = {"--processes": int}
+    parser = add_command(commands, "synth", run, summary, None, ARGUMENTS, types, preset="demo")
     for field in fields(CityOptions):
         flag, kind = f"--{field.name.replace('_', '-')}", type(field.default)
         how: dict[str, Any] = {"type": kind, "metavar": "N" if kind is int else "X"}
         if kind is bool:
             how = {"action": argparse.BooleanOptionalAction}
         parser.add_argument(flag, help=field.metadata["help"], **how)
-    parser.add_argument(
-        "--processes", type=int, metavar="N", help="number of processes (default: one for each core)"
-    )
-    parser.add_argument(
-        "--overwrite", action="store_true", help="replace another generated city in this folder"
-    )
 
 
-def run(args: argparse.Namespace) -> int:
-    """Generate the city; returns the exit status. Raises what `generate_city` raises."""
+def run(args: argparse.Namespace) -> None:
+    """Generate the city. Raises what `generate_city` raises."""
     given = {field.name: getattr(args, field.name) for field in fields(CityOptions)}
     chosen = asdict(PRESETS[args.preset]) | {name: v for name, v in given.items() if v is not None}
     started = time.monotonic()
+    how = {"processes": args.processes, "overwrite": args.overwrite}
     with image_progress("Photographing the city") as progress:
-        out = generate_city(
-            args.out, **chosen, processes=args.processes, overwrite=args.overwrite, progress=progress
-        )
+        out = generate_city(args.out, **chosen, **how, progress=progress)
     size = f"{chosen['views']} images of {chosen['width']} x {chosen['height']}"
     print(f"{out}: {size}, {time.monotonic() - started:.1f} s")
-    return 0

@@ -15,6 +15,7 @@ from blitzgs_synth.plan import (
     RETAIL,
     SIDEWALK,
     TOWERS,
+    URBAN,
     Bools,
     Doubles,
     Floats,
@@ -25,6 +26,10 @@ from blitzgs_synth.plan import (
 
 _SWAY: Final = 0.12  # standard deviation of the movement of crops, metres
 _WHITE: Final = (0.74, 0.74, 0.70)
+# Red, green and blue of five crops.
+_CROPS: Final = np.array([
+    [0.13, 0.27, 0.19, 0.15, 0.30], [0.18, 0.235, 0.14, 0.195, 0.28], [0.06, 0.12, 0.09, 0.075, 0.16],
+], np.float32)  # fmt: skip
 
 
 def ground_color(plan: Plan, noise: Noise, position: Floats, footprint: Floats, centre: Doubles) -> Floats:
@@ -39,12 +44,10 @@ def ground_color(plan: Plan, noise: Noise, position: Floats, footprint: Floats, 
     in_city_y = (y > plan.along_x.centres[0] - 8) & (y < plan.along_x.centres[-1] + 8)
     edge_x = np.abs(dx) - plan.along_y.halves[i]  # below 0 on a street along y
     edge_y = np.abs(dy) - plan.along_x.halves[j]
-    has_x = in_city_y | plan.along_y.main[i]
-    has_y = in_city_x | plan.along_x.main[j]
-    edge_x = np.where(has_x & (in_city_x | plan.along_y.main[i]), edge_x, np.float32(1e3))
-    edge_y = np.where(has_y & (in_city_y | plan.along_x.main[j]), edge_y, np.float32(1e3))
-    edge = np.minimum(edge_x, edge_y)
     inside_city = in_city_x & in_city_y
+    edge_x = np.where(inside_city | plan.along_y.main[i], edge_x, np.float32(1e3))
+    edge_y = np.where(inside_city | plan.along_x.main[j], edge_y, np.float32(1e3))
+    edge = np.minimum(edge_x, edge_y)
 
     def fill(mask: Bools, paint: object, *arguments: object) -> None:
         chosen = np.flatnonzero(mask)
@@ -60,13 +63,12 @@ def ground_color(plan: Plan, noise: Noise, position: Floats, footprint: Floats, 
     block_j = np.clip(j - (dy <= 0), 0, plan.kinds.shape[1] - 1)
     kind = plan.kinds[block_i, block_j]
     beyond = (np.abs(x) > plan.half) | (np.abs(y) > plan.half)
-    park, houses, square = kind == PARK, kind == HOUSES, (kind == PLAZA) | (kind == TOWERS)
-    fill(interior & park & ~beyond, _park, plan, x, y, block_i, block_j, footprint)
-    fill(interior & houses & ~beyond, _garden, x, y, edge, footprint)
-    fill(interior & square & ~beyond, _square, x, y, footprint)
-    fill(interior & (kind == RETAIL) & ~beyond, _car_park, plan, x, y, block_i, block_j, footprint)
-    rest = interior & ~park & ~houses & ~square & (kind != RETAIL)
-    fill(rest & ~beyond, _courtyard, x, y, footprint)
+    block = interior & ~beyond
+    fill(block & (kind == PARK), _park, plan, x, y, block_i, block_j, footprint)
+    fill(block & (kind == HOUSES), _garden, x, y, edge, footprint)
+    fill(block & ((kind == PLAZA) | (kind == TOWERS)), _square, x, y, footprint)
+    fill(block & (kind == RETAIL), _car_park, plan, x, y, block_i, block_j, footprint)
+    fill(block & (kind == URBAN), _courtyard, x, y, footprint)
     fill((interior & beyond) | (~street & ~inside_city), _fields, x, y, footprint)
     return color
 
@@ -74,8 +76,7 @@ def ground_color(plan: Plan, noise: Noise, position: Floats, footprint: Floats, 
 def _asphalt(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
     tone = noise.layers(x, y, footprint, (11.0, 0.09), (2.3, 0.07), (0.5, 0.07), (0.2, 0.06))
     repair = (cell_random(np.floor(x / 7), np.floor(y / 5), 3) > 0.88) * np.float32(-0.22)
-    color: Floats = rgb(0.155, 0.155, 0.16) * (1 + tone + repair)
-    return color
+    return rgb(0.155, 0.155, 0.16) * (1 + tone + repair)
 
 
 def _line(offset: Floats, width: float, footprint: Floats) -> Floats:
@@ -126,7 +127,6 @@ def _markings(
 
 
 def _pavement(noise: Noise, x: Floats, y: Floats, edge: Floats, footprint: Floats) -> Floats:
-    """Return paving slabs behind a lighter kerb, with a dark gutter."""
     tone = noise.layers(x, y, footprint, (5.0, 0.06), (1.2, 0.06), (0.3, 0.04))
     slab = (cell_random(np.floor(x / 0.8), np.floor(y / 0.8), 5) - 0.5) * 0.2 * resolved(0.8, footprint)
     color = rgb(0.40, 0.385, 0.36) * (1 + tone + slab)
@@ -169,7 +169,6 @@ def _park(noise: Noise, plan: Plan, x: Floats, y: Floats, i: Ints, j: Ints, foot
 
 
 def _garden(noise: Noise, x: Floats, y: Floats, edge: Floats, footprint: Floats) -> Floats:
-    """Return lawns with beds, terraces and drives."""
     color = _grass(noise, x, y, footprint, 0.06)
     cell_x, cell_y = np.floor(x / 7.3), np.floor(y / 6.1)
     chance = cell_random(cell_x, cell_y, 17)
@@ -198,7 +197,6 @@ def _square(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
 
 
 def _courtyard(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
-    """Return yards between houses: concrete and cobbles with overgrown corners."""
     tone = noise.layers(x, y, footprint, (4.0, 0.12), (1.0, 0.08), (0.3, 0.08))
     cobble = (cell_random(np.floor(x / 0.5), np.floor(y / 0.5), 29) - 0.5) * 0.35 * resolved(0.5, footprint)
     color = rgb(0.31, 0.29, 0.26) * (1 + tone + cobble)
@@ -225,17 +223,7 @@ def _fields(noise: Noise, x: Floats, y: Floats, footprint: Floats) -> Floats:
     row = np.floor(v / 62 + 0.15 * noise(u / 300, v / 300))
     column = np.floor(u / 95 + cell_random(row, row, 31))
     crop = cell_random(column, row, 37)
-    palette = np.array(
-        [
-            [0.13, 0.18, 0.06],
-            [0.27, 0.235, 0.12],
-            [0.19, 0.14, 0.09],
-            [0.15, 0.195, 0.075],
-            [0.30, 0.28, 0.16],
-        ],
-        np.float32,
-    )
-    color: Floats = palette.T.take(np.minimum((crop * 5).astype(np.int64), 4), axis=1)
+    color: Floats = _CROPS.take(np.minimum((crop * 5).astype(np.int64), 4), axis=1)
     turned = cell_random(column, row, 41) > 0.5
     furrows = (stripes(np.where(turned, u, v), 2.6, 0.0, 0.5, footprint) - 0.5) * 0.22
     tone = noise.layers(x, y, footprint, (40.0, 0.08), (9.0, 0.09), (2.0, 0.09), (0.6, 0.10))

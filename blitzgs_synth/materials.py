@@ -48,8 +48,7 @@ class Noise:
             periods *= np.float32(_LATTICE * _TEXELS)
         u, v = maps.reshape(2, rows, _ROW)
         sampled = cv2.remap(self._texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        values: Floats = sampled.reshape(-1)[:count]
-        return values
+        return sampled.reshape(-1)[:count]
 
     def layers(self, x: Floats, y: Floats, footprint: Floats, *bands: tuple[float, float]) -> Floats:
         """Return a sum of bands (wavelength in metres, amplitude), each faded out where it is unresolved."""
@@ -90,8 +89,7 @@ def stripes(
 
     def integral(t: Floats) -> Floats:
         whole = np.floor(t)
-        filled: Floats = whole * (high - low) + np.clip(t - whole - low, 0, high - low)
-        return filled
+        return whole * (high - low) + np.clip(t - whole - low, 0, high - low)
 
     covered: Floats = (integral(scaled + half) - integral(scaled - half)) / (2 * half)
     return covered.astype(np.float32)
@@ -165,10 +163,8 @@ def facade(p: Points, noise: Noise) -> Floats:
 
     frame = np.where(style == BRICK, np.float32(0.8), np.float32(0.85))
     wall = mix(wall, frame, 0.8 * cover(0.11))
-    ledge = inside(du, -half_width - 0.2, half_width + 0.2, p.footprint) * inside(
-        dv, sill - 0.3, sill - 0.12, p.footprint
-    )
-    wall = mix(wall, wall * 0.6, ledge * wide_enough)
+    ledge = inside(du, -half_width - 0.2, half_width + 0.2, p.footprint) * wide_enough
+    wall = mix(wall, wall * 0.6, ledge * inside(dv, sill - 0.3, sill - 0.12, p.footprint))
     return mix(wall, _panes(p, column, row, du, dv, is_shop), cover(0.0))
 
 
@@ -223,9 +219,8 @@ def tiles(p: Points, noise: Noise) -> Floats:
     patch = noise.layers(p.u + seed, p.v, p.footprint, (5.0, 0.09), (1.1, 0.07))
     color = p.color * (1 + 0.45 * single + patch)
     color = mix(color, color * 0.45, 0.8 * stripes(p.v, course, 0.0, 0.2, p.footprint))
-    color = mix(
-        color, color * 0.65, 0.6 * stripes(p.u + 0.5 * across * (row % 2), across, 0.0, 0.15, p.footprint)
-    )
+    joints = stripes(p.u + 0.5 * across * (row % 2), across, 0.0, 0.15, p.footprint)
+    color = mix(color, color * 0.65, 0.6 * joints)
     moss = np.clip(noise((p.u + seed) / 2.6, p.v / 2.6) - 0.9, 0, 0.8) * (1.1 - p.v / p.size[1])
     color = mix(color, (0.17, 0.18, 0.09), 0.6 * np.clip(moss, 0, 1))
     cell_u, cell_v = np.floor(p.u / 3.2), np.floor(p.v / 2.6)
@@ -254,8 +249,7 @@ def plain(p: Points, noise: Noise) -> Floats:
     """Return concrete, plaster, painted boards: the colour with weathering."""
     x = p.u + p.position[0] + p.numbers[0]
     tone = noise.layers(x, p.v + p.position[1], p.footprint, (3.0, 0.07), (0.7, 0.07), (0.25, 0.05))
-    weathered: Floats = p.color * (1 + tone)
-    return weathered
+    return p.color * (1 + tone)
 
 
 def solar(p: Points, noise: Noise) -> Floats:

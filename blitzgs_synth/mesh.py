@@ -50,15 +50,12 @@ class MeshBuilder:
     """Collects quads and blobs in plan coordinates."""
 
     def __init__(self) -> None:
-        self._quads: list[tuple[Point, Point, Point, Point]] = []
-        self._blobs: list[tuple[float, ...]] = []  # centre, radii
-        self._looks: list[Look] = []
-        self._blob_looks: list[Look] = []
+        self._quads: list[tuple[tuple[Point, Point, Point, Point], Look]] = []
+        self._blobs: list[tuple[tuple[float, ...], Look]] = []  # centre and radii
 
     def quad(self, a: Point, b: Point, c: Point, d: Point, look: Look) -> None:
         """Add a quad, counter-clockwise from outside; u runs from a to b. c = d makes a triangle."""
-        self._quads.append((a, b, c, d))
-        self._looks.append(look)
+        self._quads.append(((a, b, c, d), look))
 
     def walls(self, x0: float, y0: float, x1: float, y1: float, z0: float, z1: float, look: Look) -> None:
         """Add the four walls of a box."""
@@ -85,12 +82,11 @@ class MeshBuilder:
 
     def blob(self, centre: Point, radii: Point, look: Look) -> None:
         """Add a bumpy ellipsoid (the crown of a tree, a bush)."""
-        self._blobs.append((*centre, *radii))
-        self._blob_looks.append(look)
+        self._blobs.append(((*centre, *radii), look))
 
     def build(self, plan: Plan) -> Mesh:
         """Bend everything into the world and return the mesh."""
-        corners = plan.bend(np.array(self._quads, dtype=np.float64).reshape(-1, 4, 3))
+        corners = plan.bend(np.array([quad for quad, _ in self._quads], np.float64).reshape(-1, 4, 3))
         edge_u = corners[:, 1] - corners[:, 0]
         size_u = np.linalg.norm(edge_u, axis=1)
         axis_u = edge_u / size_u[:, None]
@@ -100,16 +96,16 @@ class MeshBuilder:
         axis_v = edge_v / size_v[:, None]
         quad_triangles = corners[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3, 3)
 
-        blobs = np.array(self._blobs, dtype=np.float64).reshape(-1, 6)
+        blobs = np.array([blob for blob, _ in self._blobs], np.float64).reshape(-1, 6)
         centres = plan.bend(blobs[:, :3])
-        blob_triangles, per_blob = _blob_triangles(centres, blobs[:, 3:], [x.seed for x in self._blob_looks])
+        seeds = [look.seed for _, look in self._blobs]
+        blob_triangles, per_blob = _blob_triangles(centres, blobs[:, 3:], seeds)
 
         count, round_count = len(corners), len(blobs)
-        looks = self._looks + self._blob_looks
+        looks = [look for _, look in (*self._quads, *self._blobs)]
         unit = np.tile(np.eye(3)[None], (round_count, 1, 1))
-        surface = np.concatenate(
-            [np.repeat(np.arange(count), 2), count + np.repeat(np.arange(round_count), per_blob)]
-        )
+        of_blobs = count + np.repeat(np.arange(round_count), per_blob)
+        surface = np.concatenate([np.repeat(np.arange(count), 2), of_blobs])
         return Mesh(
             triangles=np.concatenate([quad_triangles, blob_triangles]).astype(np.float32),
             surface=surface.astype(np.int32),

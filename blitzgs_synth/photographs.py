@@ -90,10 +90,12 @@ def take_photographs(
         if corners is None:
             image = _exposed(city.render(view), index, options)
             corners = find_corners(city, view, image, options.points_per_view, options.seed)
-            encoded = _encode_jpeg(path, image)
+            done, encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+            if not done:
+                raise OSError(f"{path}: the image could not be encoded as JPEG")
             # Checksums find files that a power failure tore, so the files are not synced to disk.
-            write_file(path, encoded, sync=False)
-            write_file(record, _pack(corners, encoded), sync=False)
+            write_file(path, encoded.tobytes(), sync=False)
+            write_file(record, _pack(corners, encoded.tobytes()), sync=False)
         return corners
 
     found = []
@@ -113,8 +115,7 @@ def _exposed(image: Bytes, index: int, options: CityOptions) -> Bytes:
     gains = np.exp(options.exposure * (rng.standard_normal() + 0.25 * rng.standard_normal(3)))
     values = image.astype(np.float32) * gains.astype(np.float32)
     values += np.float32(options.grain) * rng.standard_normal(image.shape, np.float32)
-    exposed: Bytes = np.clip(values + 0.5, 0, 255).astype(np.uint8)
-    return exposed
+    return np.clip(values + 0.5, 0, 255).astype(np.uint8)
 
 
 def _finished(image: Path, record: Path) -> Corners | None:
@@ -134,10 +135,3 @@ def _pack(corners: Corners, encoded: bytes) -> bytes:
     arrays = {name: getattr(corners, name) for name in _FIELDS}
     np.savez(buffer, checksum=np.uint32(zlib.crc32(encoded)), **arrays)
     return buffer.getvalue()
-
-
-def _encode_jpeg(path: Path, image: Bytes) -> bytes:
-    done, encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    if not done:
-        raise OSError(f"{path}: the image could not be encoded as JPEG")
-    return encoded.tobytes()

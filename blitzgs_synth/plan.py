@@ -24,8 +24,7 @@ Bytes = NDArray[np.uint8]
 
 def dot(a: Floats, b: Floats) -> Floats:
     """Return the inner products [R] of columns [3, R], or of one vector [3] with each column."""
-    product: Floats = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-    return product
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def transformed(matrix: Floats, columns: Floats) -> Floats:
@@ -89,29 +88,19 @@ class CityOptions:
         return {"format_version": FORMAT_VERSION, **values}
 
 
+# Extent, views, width and height, and others by their names.
 PRESETS = {
     # Takes well under a minute on two cores; the default scene of `make demo`.
     "demo": CityOptions(),
     # A quarter of a square kilometre in as many views as an aerial survey would take.
-    "town": CityOptions(extent=500.0, views=400, width=1368, height=912, points_per_view=1000),
+    "town": CityOptions(500.0, 400, 1368, 912, points_per_view=1000),
     # More than two square kilometres, with the views and the image size of the usual large captures.
-    "city": CityOptions(extent=1600.0, views=2048, width=1368, height=912, points_per_view=1200),
+    "city": CityOptions(1600.0, 2048, 1368, 912, points_per_view=1200),
     # Four square kilometres from three heights.
-    "metropolis": CityOptions(
-        extent=2000.0, views=5120, width=1368, height=912, points_per_view=1200, altitudes=3
-    ),
+    "metropolis": CityOptions(2000.0, 5120, 1368, 912, points_per_view=1200, altitudes=3),
     # Flat crops from straight above, with grain: a capture on which training can lose what it has learnt
     # (docs/decisions.md).
-    "farmland": CityOptions(
-        extent=600.0,
-        views=166,
-        width=800,
-        height=600,
-        points_per_view=450,
-        oblique=0.0,
-        built=False,
-        grain=5.0,
-    ),
+    "farmland": CityOptions(600.0, 166, 800, 600, 450, oblique=0.0, built=False, grain=5.0),
 }
 
 
@@ -129,6 +118,11 @@ class Streets:
     centres: Floats  # [S]
     halves: Floats  # [S]
     main: Bools  # [S] whether a street is wide; wide streets go on beyond the city
+
+    def between(self, i: int) -> tuple[float, float]:
+        """Return where the sidewalks of street i and the next one end."""
+        low, high = self.centres[i] + self.halves[i], self.centres[i + 1] - self.halves[i + 1]
+        return float(low) + SIDEWALK, float(high) - SIDEWALK
 
     def nearest(self, coordinate: Floats) -> tuple[Floats, Ints]:
         """Return signed distances [R] to the nearest centre line and its index [R]."""
@@ -163,13 +157,8 @@ class Plan:
 
     def block(self, i: int, j: int) -> Rectangle:
         """Return block (i, j) inside its sidewalks, in plan metres."""
-        x, y = self.along_y, self.along_x
-        return (
-            float(x.centres[i] + x.halves[i]) + SIDEWALK,
-            float(y.centres[j] + y.halves[j]) + SIDEWALK,
-            float(x.centres[i + 1] - x.halves[i + 1]) - SIDEWALK,
-            float(y.centres[j + 1] - y.halves[j + 1]) - SIDEWALK,
-        )
+        (x0, x1), (y0, y1) = self.along_y.between(i), self.along_x.between(j)
+        return x0, y0, x1, y1
 
     def bend(self, points: Doubles) -> Doubles:
         """Return plan points [..., 3] moved into the world."""

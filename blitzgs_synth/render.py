@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
 
+from blitzgs.util.errors import optional_package
 from blitzgs_synth import materials, mesh
 from blitzgs_synth.city import build_city
 from blitzgs_synth.flight import View
@@ -31,17 +32,13 @@ class RayCaster:
 
     def __init__(self, triangles: Floats) -> None:
         """Build the acceleration structure of `triangles` [T, 3, 3] (metres)."""
-        try:
-            from embreex.mesh_construction import TriangleMesh
-            from embreex.rtcore_scene import EmbreeScene
-        except ModuleNotFoundError as error:
-            raise ModuleNotFoundError(
-                "generating a synthetic city casts rays with Embree: install it with "
-                "`pip install embreex` (or `pip install 'blitzgs[synth]'`)"
-            ) from error
+        scenes, meshes = (
+            optional_package(f"embreex.{name}", "synth", "generating a synthetic city")
+            for name in ("rtcore_scene", "mesh_construction")
+        )
         # Watertight intersection (`robust`) would take a sixth longer and changes a few rays in a million.
-        self._scene: Any = EmbreeScene(robust=False)
-        self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(triangles, dtype=np.float32))
+        self._scene = scenes.EmbreeScene(robust=False)
+        self._mesh = meshes.TriangleMesh(self._scene, np.ascontiguousarray(triangles, dtype=np.float32))
         # The first query commits the scene; later ones only read it and may run concurrently.
         self._scene.run(np.zeros((1, 3), np.float32), np.array([[0, 0, -1]], np.float32))
 
@@ -257,8 +254,7 @@ class City:
         origins += np.ascontiguousarray(lift.T).take(lit, 0)
         dark = self.caster.occluded(origins, np.broadcast_to(_SUN, origins.shape))
         share = np.bincount(lit[dark], minlength=len(count)).astype(np.float32) / count
-        sunny: Floats = np.clip(facing, 0, 1) * (1 - share)
-        return sunny
+        return np.clip(facing, 0, 1) * (1 - share)
 
     def _light(self, position: Floats, normal: Floats, sunny: Floats) -> Floats:
         """Return the irradiance [3, G]: sun outside shadows, sky by openness, light from the ground."""
@@ -315,15 +311,13 @@ class City:
         inside = (x >= 0) & (x < side) & (y >= 0) & (y < side)
         low = np.where(inside, self._open_sky.take(y * side + x, mode="clip"), np.float32(1))
         raised = np.clip(position[2] / 16, 0, 1)
-        openness: Floats = np.maximum(low, 0.35) * (1 - raised) + raised
-        return openness
+        return np.maximum(low, 0.35) * (1 - raised) + raised
 
 
 def _tone(linear: Floats) -> Floats:
     """Return display values [0, 1] of scene-linear colours: a filmic shoulder, then the sRGB curve."""
     x = np.float32(0.54) * linear
     filmic = np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1)
-    display: Floats = np.where(
+    return np.where(
         filmic < 0.0031308, 12.92 * filmic, 1.055 * np.power(np.maximum(filmic, 1e-6), 1 / 2.4) - 0.055
     ).astype(np.float32)
-    return display

@@ -138,8 +138,7 @@ def may_see(view: View, balls: Doubles) -> Bools:
     x, y, z = transformed(view.rotation, (balls[:, :3] - view.centre).T).T
     half = np.array([view.width, view.height]) / (2 * view.focal)
     outside = np.stack([np.abs(x) - half[0] * z, np.abs(y) - half[1] * z]) / np.hypot(half, 1)[:, None]
-    reached: Bools = np.maximum(outside.max(0), -z) < balls[:, 3]
-    return reached
+    return np.maximum(outside.max(0), -z) < balls[:, 3]
 
 
 def _observed(
@@ -158,8 +157,7 @@ def _observed(
     candidates, distance = candidates[found], distance[found]
     hits = city.hit(view, pixels[candidates])
     visible = np.abs(hits.distance - distance) < _SAME_PLACE * distance
-    reached: Ints = candidates[visible | own[candidates]]
-    return reached
+    return candidates[visible | own[candidates]]
 
 
 def _triangulated(

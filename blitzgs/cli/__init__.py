@@ -54,10 +54,7 @@ COMMANDS = {
     "gate": ("blitzgs.cli.gate", "fit and evaluate spawn gates, which make smaller models"),
     "doctor": ("blitzgs.cli.doctor", "check this installation"),
     "completion": ("blitzgs.cli.completion", "print a script that completes commands in a shell"),
-    "synth": (
-        "blitzgs.cli.arguments:add_synth",
-        "make a synthetic city: photographs, cameras and points to train on",
-    ),
+    "synth": ("blitzgs_synth.generate", "make a synthetic city: photographs, cameras and points to train on"),
 }
 
 
@@ -110,8 +107,7 @@ def _run(given: list[str]) -> int:
         # Those of Python's imports and of YAML have lines.
         lines = isinstance(error, ImportError) or type(error).__name__ == "ConfigError"
         text = f"{name}: {printable(_message(error), lines)}"
-        console = Console(stderr=True, highlight=False, emoji=False)
-        console.print(text, style="red", markup=False, soft_wrap=True)
+        Console(stderr=True).out(text, style="red", highlight=False)
         return 1
 
 
@@ -125,7 +121,6 @@ def _tell_other_ranks(message: str) -> None:
 
 
 def _arguments(parser: Parser, chosen: str, given: list[str]) -> argparse.Namespace:
-    """Parse the command line; exit with status 2 if it is wrong."""
     args, unknown = parser.parse_known_args(given)
     parser_of = getattr(args, "parser", parser)
     if chosen == "train":
@@ -187,11 +182,8 @@ def _importing(name: str) -> Iterator[None]:
 
 def _message(error: BaseException) -> str:
     """Return the error's text; for an error of the operating system, the file and the reason."""
-    if isinstance(error, MemoryError):
-        return (
-            str(error)
-            or "the memory is not sufficient: use smaller images (--data.downscale) or a larger machine"
-        )
+    if isinstance(error, MemoryError) and not str(error):
+        return "the memory is not sufficient: use smaller images (--data.downscale) or a larger machine"
     if not isinstance(error, OSError) or error.filename is None or error.strerror is None:
         return str(error)
     if isinstance(error, (FileExistsError, NotADirectoryError)):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+from contextlib import suppress
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from blitzgs.capture.world import (
     gps_positions,
     reference_system,
 )
-from blitzgs.cli.arguments import Commands, add_capture, add_command, add_flags, add_run
+from blitzgs.cli.arguments import DATA, RUN, Commands, add_arguments, add_command
 from blitzgs.config.files import load_config
 from blitzgs.runs import run_files
 from blitzgs.runs.world import load_world_frame, save_world_frame
@@ -52,12 +53,9 @@ GIVEN = """
 
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "align", run, summary, HELP)
-    add_run(parser)
-    how = parser.add_mutually_exclusive_group()
-    add_flags(how, GIVEN)
-    add_flags(parser, "--crs EPSG:N  reference system of the points, or wanted")
-    add_capture(parser)
+    text = f"{RUN}{DATA}--crs EPSG:N  reference system of the points, or wanted"
+    parser = add_command(commands, "align", run, summary, HELP, text)
+    add_arguments(parser.add_mutually_exclusive_group(), GIVEN)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -98,12 +96,9 @@ def _by_points(args: argparse.Namespace, capture: Capture) -> WorldFrame:
 
 def _check_lengths(crs: str) -> None:
     """Refuse a reference system of angles, in which points make no similarity; unknown without pyproj."""
-    try:
-        system = reference_system(crs)
-    except ImportError:
-        return
-    if system.is_geographic:
-        raise ValueError(f"{crs} has angles: convert the points to a projected system, such as a UTM zone")
+    with suppress(ImportError):
+        if reference_system(crs).is_geographic:
+            raise ValueError(f"{crs} has angles: convert the points to a projected system, as a UTM zone")
 
 
 def _warn_if_turned_over(frame: WorldFrame, capture: Capture) -> None:
@@ -154,7 +149,6 @@ def _by_gps(args: argparse.Namespace, capture: Capture) -> WorldFrame:
 
 
 def _centres(capture: Capture) -> Float64:
-    """Return the positions of the cameras in the capture's own world, [V, 3]."""
     poses = np.stack([camera.world_to_camera for camera in capture.cameras])
     return camera_centres(poses) + capture.offset
 
@@ -164,13 +158,10 @@ def _converted(args: argparse.Namespace, capture: Capture) -> WorldFrame:
     if known is None or not known.crs:
         _check_lengths(args.crs)
         frame = known or WorldFrame()
-        return dataclasses.replace(
-            frame, crs=args.crs, source=frame.source or "the capture's own coordinates"
-        )
+        source = frame.source or "the capture's own coordinates"
+        return dataclasses.replace(frame, crs=args.crs, source=source)
     some = capture.points[:: max(1, len(capture.points) // 1000)] + capture.offset
     places = np.concatenate([_centres(capture), some])
     frame, error = frame_in(known, args.crs, places)
-    print(
-        f"a similarity instead of the projection is wrong by at most {error:.3g} m at the cameras and points"
-    )
+    print(f"a similarity for the projection is wrong by at most {error:.3g} m at the cameras and points")
     return frame

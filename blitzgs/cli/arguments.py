@@ -11,6 +11,7 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from blitzgs.config.files import REMOVED
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 Number = TypeVar("Number", int, float)
 Commands = argparse._SubParsersAction  # argparse has no public name for it
+Types = Mapping[str, Callable[[str], Any]]  # the functions that read the values of arguments, by their names
 
 
 def add_command(
@@ -31,11 +33,15 @@ def add_command(
     function: Callable[[argparse.Namespace], int | None],
     summary: str,
     description: str | None = None,
+    arguments: str = "",
+    types: Types = MappingProxyType({}),
     add_help: bool = True,
+    **defaults: Any,
 ) -> argparse.ArgumentParser:
     """Add a command that calls `function` with its arguments and exits with what it returns, or 0.
 
-    Without `add_help`, the caller adds the flag --help.
+    `arguments` and `types` are those of `add_arguments`, `defaults` the values of arguments that are not
+    given. Without `add_help`, the caller adds the flag --help.
     """
     parser = commands.add_parser(
         name,
@@ -44,75 +50,38 @@ def add_command(
         formatter_class=HelpFormatter,
         add_help=add_help,
     )
-    parser.set_defaults(run=function, parser=parser)
+    add_arguments(parser, arguments, types)
+    parser.set_defaults(run=function, parser=parser, **defaults)
     return parser
 
 
-def add_synth(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
-    """Add `blitzgs synth`, a package of its own."""
-    import blitzgs_synth
+def add_arguments(parser: argparse._ActionsContainer, text: str, types: Types = MappingProxyType({})) -> None:
+    """Add the arguments that a text describes.
 
-    blitzgs_synth.add_arguments(add_command(commands, "synth", blitzgs_synth.run, summary))
-
-
-def named_path(text: str) -> Path:
-    """Return a path; refuse an empty one, because `--out "$UNSET"` would mean the current folder."""
-    if not text:
-        raise argparse.ArgumentTypeError("the path is empty")
-    return Path(text)
-
-
-def add_path(parser: argparse._ActionsContainer, name: str, metavar: str, text: str, **more: Any) -> None:
-    """Add an argument that is a path, and no empty one; `text` is its help."""
-    parser.add_argument(name, type=named_path, metavar=metavar, help=text, **more)
-
-
-_PATHS = ("FILE", "DIR", "RUN")
-_FLAG = re.compile(r"(--[\w-]+)(?: (\S+))?  (.*)", re.DOTALL)
-
-
-def add_flags(
-    parser: argparse._ActionsContainer, text: str, types: Mapping[str, Callable[[str], Any]] | None = None
-) -> None:
-    """Add the flags that a text describes.
-
-    A line is "--name METAVAR  help", or "--name  help" for a switch; indented lines go on with the help.
-    `types` has the functions that read values, by name; of others, FILE, DIR and RUN are paths.
+    A line is "--name METAVAR  help", "--name  help" for a switch, or "name METAVAR  help" for an argument
+    without a flag; indented lines go on with the help. A flag is required if its help ends so. Of METAVARs
+    in small letters, "one|two" are the only values; "RUN..." takes one or more; "[K=1]" means 1 without a
+    value. `types` has the functions that read values, by name; others follow from the METAVAR.
     """
-    for entry in re.split(r"\n(?=--)", text.strip()):
-        match = _FLAG.fullmatch(entry)
+    for entry in re.split(r"\n(?=\S)", text.strip()) if text else ():
+        match = _ARGUMENT.fullmatch(entry)
         assert match is not None, entry
         name, metavar, meaning = match[1], match[2], " ".join(match[3].split())
         if metavar is None:
             parser.add_argument(name, action="store_true", help=meaning)
+            continue
+        word, _, implied = metavar.removesuffix("...").strip("[]").partition("=")
+        kind = types.get(name) or _TYPES.get(word, str)
+        more: dict[str, Any] = {"required": True} if meaning.endswith("(required)") else {}
+        if "|" in word and word == word.lower():
+            more["choices"] = [kind(choice) for choice in word.split("|")]
         else:
-            kind = (types or {}).get(name, named_path if metavar in _PATHS else str)
-            parser.add_argument(name, type=kind, metavar=metavar, help=meaning)
-
-
-def add_run(parser: argparse.ArgumentParser) -> None:
-    """Add the argument RUN, the folder of a run."""
-    add_path(parser, "folder", "RUN", "folder that blitzgs train wrote (its --out)")
-
-
-def add_model(parser: argparse.ArgumentParser) -> None:
-    """Add the argument MODEL: the folder of a run, a checkpoint in it, or a file of Gaussians."""
-    add_path(parser, "model", "MODEL", "run, checkpoint, or file of Gaussians")
-
-
-def add_capture(parser: argparse.ArgumentParser) -> None:
-    """Add the flag --data, the present folder of a run's capture."""
-    add_flags(parser, "--data DIR  folder of the capture, if it has moved since the training")
-
-
-def add_pool(parser: argparse.ArgumentParser) -> None:
-    """Add the flag --resident-gb: views may need a larger pool on fewer ranks than the run was trained on."""
-    allowed = RANGES["memory.resident_gb"]
-    text = """
---resident-gb GB  gigabytes of each device that hold Gaussians; those that do not fit stay in host memory; 0:
-    all are on the device (default: memory.resident_gb of the run)
-"""
-    add_flags(parser, text, {"--resident-gb": number(float, lambda value: value in allowed, str(allowed))})
+            more["metavar"] = word
+        if implied:
+            more |= {"nargs": "?", "const": kind(implied)}
+        elif metavar.endswith("..."):
+            more["nargs"] = "+"
+        parser.add_argument(name, type=kind, help=meaning, **more)
 
 
 def number(
@@ -129,14 +98,33 @@ def number(
     return parsed
 
 
-def add_split(parser: argparse.ArgumentParser, verb: str) -> None:
-    """Add the flag --split, which views of the run to use; `verb` says for what."""
-    parser.add_argument(
-        "--split",
-        choices=("test", "train", "all"),
-        default="test",
-        help=f"views to {verb} (default: %(default)s)",
-    )
+def named_path(text: str) -> Path:
+    """Return a path; refuse an empty one, because `--out "$UNSET"` would mean the current folder."""
+    if not text:
+        raise argparse.ArgumentTypeError("the path is empty")
+    return Path(text)
+
+
+_ARGUMENT = re.compile(r"([\w-]+)(?: (\S+))?  (.*)", re.DOTALL)
+_PATHS = ("FILE", "DIR", "DIR|FILE", "RUN", "MODEL", "PHOTOS", "CAPTURE", "NEW")
+_SIZES = RANGES["memory.resident_gb"]
+_TYPES: Types = {
+    **dict.fromkeys(_PATHS, named_path),
+    "GB": number(float, _SIZES.__contains__, str(_SIZES)),
+}
+
+# Arguments of several commands.
+RUN = "folder RUN  folder that blitzgs train wrote (its --out)\n"
+MODEL = "model MODEL  run, checkpoint, or file of Gaussians\n"
+DATA = "--data DIR  folder of the capture, if it has moved since the training\n"
+DEVICE = "--device DEVICE  auto (a GPU when there is one), cpu, cuda or cuda:N (default: %(default)s)\n"
+DEVICES = f"{DEVICE}--share-gpus  with torchrun: let several processes use one GPU (slow)\n"
+# Views may need a larger pool on fewer ranks than the run was trained on.
+POOL = """\
+--resident-gb GB  gigabytes of each device that hold Gaussians; those that do not fit stay in host memory; 0:
+    all are on the device (default: memory.resident_gb of the run)
+"""
+SPLIT = "--split test|train|all  views to use (default: %(default)s)\n"
 
 
 def chosen_views(split: str, cameras: Capture | RunCameras, folder: Path) -> Sequence[int]:
@@ -145,14 +133,6 @@ def chosen_views(split: str, cameras: Capture | RunCameras, folder: Path) -> Seq
     if not indices:
         raise ValueError(f"{folder} has no {split} views: choose another --split")
     return indices
-
-
-def add_device(parser: argparse.ArgumentParser, shares_gpus: bool = False) -> None:
-    """Add the flag --device and, if `shares_gpus`, --share-gpus."""
-    add_flags(parser, "--device DEVICE  auto (a GPU when there is one), cpu, cuda or cuda:N (default: auto)")
-    parser.set_defaults(device="auto")
-    if shares_gpus:
-        add_flags(parser, "--share-gpus  with torchrun: let several processes use one GPU (slow)")
 
 
 class HelpFormatter(argparse.HelpFormatter):

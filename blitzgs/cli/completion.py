@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Iterator
 
 from blitzgs.cli import COMMANDS, parser_of
@@ -42,8 +43,7 @@ complete -o default -F _blitzgs blitzgs
 
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "completion", run, summary, HELP)
-    parser.add_argument("shell", metavar="SHELL", choices=("bash", "zsh", "fish"))
+    add_command(commands, "completion", run, summary, HELP, "shell bash|zsh|fish  the shell")
 
 
 def run(args: argparse.Namespace) -> None:
@@ -61,11 +61,10 @@ def script(shell: str) -> str:
         words, actions = _after(parser)
         flags.append(f"      {name}) flags='{' '.join(actions)}' ;;")
         after = {flag: _choices(action) for flag, action in actions.items()} | {name: words}
-        choices += [
-            f"      '{name} {before}') words='{' '.join(few)}' ;;" for before, few in after.items() if few
-        ]
-    text = _BASH.replace("@commands@", " ".join(commands)).replace("@flags@", "\n".join(flags))
-    text = text.replace("@choices@", "\n".join(choices))
+        lists = ((before, " ".join(few)) for before, few in after.items() if few)
+        choices += [f"      '{name} {before}') words='{few}' ;;" for before, few in lists]
+    parts = {"@commands@": " ".join(commands), "@flags@": "\n".join(flags), "@choices@": "\n".join(choices)}
+    text = re.sub("@[a-z]+@", lambda match: parts[match[0]], _BASH)
     return text if shell == "bash" else f"autoload -U +X bashcompinit && bashcompinit\n{text}"
 
 
@@ -79,12 +78,8 @@ def _after(parser: argparse.ArgumentParser) -> tuple[list[str], dict[str, argpar
         if isinstance(action, argparse._SubParsersAction):
             for each in action.choices.values():
                 flags |= _after(each)[1]
-        flags |= {
-            flag: action
-            for flag in action.option_strings
-            if flag.startswith("--") and flag[2:] not in REMOVED
-        }
-    return words, flags
+        flags |= {flag: action for flag in action.option_strings if flag.startswith("--")}
+    return words, {flag: action for flag, action in flags.items() if flag[2:] not in REMOVED}
 
 
 def _choices(action: argparse.Action) -> list[str]:

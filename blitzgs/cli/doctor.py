@@ -19,13 +19,13 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from blitzgs import __version__
-from blitzgs.cli.arguments import Commands, add_command, add_flags
+from blitzgs.cli.arguments import Commands, add_command
 from blitzgs.cli.doctor_probes import REINSTALL, REPORT, found
 
 HELP = """\
@@ -41,7 +41,7 @@ and says what mends it. The exit status is 1 if something that BlitzGS cannot do
 Put the output of --json into reports of faults.
 """
 
-FLAGS = """
+ARGUMENTS = """
 --json  print the report as JSON
 --folder DIR  measure the disk of this folder too, with a file of 64 MB that is removed
 """
@@ -71,8 +71,7 @@ class ProbeError(Exception):
 
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "doctor", run, summary, HELP)
-    add_flags(parser, FLAGS)
+    add_command(commands, "doctor", run, summary, HELP, ARGUMENTS)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -102,11 +101,10 @@ def examine(folder: Path | None = None) -> list[Line]:
     # Each with what mends a look that fails, whether it is required, the look and its arguments.
     checks: list[tuple[Any, ...]] = [("lib io", REINSTALL, True, probe, "library", "io")]
     if works:
-        backends, architectures = ["cpu", *(["cuda"] if gpus else [])], [gpu["architecture"] for gpu in gpus]
-        checks += [
-            (f"lib {name}", REINSTALL, True, probe, "library", name, *architectures) for name in backends
-        ]
-        checks += [(f"render {name}", REINSTALL, True, probe, "render", name) for name in backends]
+        architectures = [gpu["architecture"] for gpu in gpus]
+        for name in ("cpu", "cuda") if gpus else ("cpu",):
+            checks.append((f"lib {name}", REINSTALL, True, probe, "library", name, *architectures))
+            checks.append((f"render {name}", REINSTALL, True, probe, "render", name))
         checks.append(("exchange Gloo", _LOCAL, False, _exchange, "cpu"))
         if len(gpus) > 1:
             checks.append(("exchange NCCL", _LOCAL, False, _exchange, "cuda"))
@@ -136,10 +134,9 @@ def probe(name: str, *arguments: str) -> dict[str, Any]:
     command = [sys.executable, "-m", "blitzgs.cli.doctor_probes", name, *arguments]
     output = run_command(command)
     try:
-        result: dict[str, Any] = json.loads(output.splitlines()[-1])
+        return dict(json.loads(output.splitlines()[-1]))
     except (IndexError, ValueError) as error:
         raise ProbeError(f"printed no result: {output[-200:]!r}") from error
-    return result
 
 
 def run_command(command: Sequence[str]) -> str:
@@ -150,9 +147,8 @@ def run_command(command: Sequence[str]) -> str:
     path = os.pathsep.join(filter(None, [str(_PACKAGE.parent), os.environ.get("PYTHONPATH")]))
     environment = os.environ | {"PYTHONPATH": path}
     try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", env=environment, timeout=TIMEOUT
-        )
+        how: dict[str, Any] = {"capture_output": True, "text": True, "errors": "replace"}
+        done = subprocess.run(command, env=environment, timeout=TIMEOUT, **how)
     except OSError as error:
         raise ProbeError(f"{command[0]}: {error.strerror}") from error
     except subprocess.TimeoutExpired:
@@ -167,20 +163,16 @@ def run_command(command: Sequence[str]) -> str:
 
 def _system() -> Line:
     cores = len(os.sched_getaffinity(0))
-    text = (
-        f"Python {platform.python_version()}, {' '.join(platform.libc_ver())}, Linux {platform.release()}, "
-        f"{cores} of {os.cpu_count()} cores"
-    )
+    versions = f"Python {platform.python_version()}, {' '.join(platform.libc_ver())}"
+    text = f"{versions}, Linux {platform.release()}, {cores} of {os.cpu_count()} cores"
     if sys.platform != "linux" or platform.machine() != "x86_64":
         return Line("system", "failed", f"{text}, {platform.machine()}", "BlitzGS runs on Linux x86-64")
     return Line("system", "ok", text, values={"cores": cores})
 
 
 def _memory() -> Line:
-    found = re.findall(
-        r"^(MemTotal|MemAvailable): +(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE
-    )
-    total, free = (1024 * int(dict(found)[name]) for name in ("MemTotal", "MemAvailable"))
+    found = dict(re.findall(r"^(\w+): +(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE))
+    total, free = (1024 * int(found[name]) for name in ("MemTotal", "MemAvailable"))
     text = f"{free / 1e9:.1f} of {total / 1e9:.1f} GB free"
     little = free < _LITTLE_MEMORY
     remedy = "end other programs, or train with --data.downscale=2" if little else ""
@@ -230,12 +222,12 @@ def _torch() -> Line:
     version = _version(found["version"])
     cuda = f"CUDA {found['cuda']}" if found["cuda"] else "for CPUs only"
     nccl = f", NCCL {found['nccl']}" if found["nccl"] else ""
-    text = f"{found['version']}, {cuda}{nccl}, {found['threads']} threads"
+    line = Line("torch", "ok", f"{found['version']}, {cuda}{nccl}, {found['threads']} threads", values=found)
     if version < _version(bounds.get(">=", "0")):
-        return Line("torch", "failed", f"{text}: too old", install, values=found)
+        return replace(line, state="failed", text=f"{line.text}: too old", remedy=install)
     if "<" in bounds and version >= _version(bounds["<"]):
-        return Line("torch", "warning", f"{text}: newer than what is tested", install, values=found)
-    return Line("torch", "ok", text, values=found)
+        return replace(line, state="warning", text=f"{line.text}: newer than what is tested", remedy=install)
+    return line
 
 
 def _driver() -> dict[str, Any]:
@@ -256,12 +248,10 @@ def _gpu(number: int, gpu: dict[str, Any]) -> Line:
 def _nvcc() -> dict[str, Any]:
     if shutil.which("nvcc") is None:
         return found("missing", "only needed to build the CUDA library from the sources")
-    release = re.search(r"release [\d.]+", run_command(["nvcc", "--version"]))
-    return found("ok", release[0] if release else "")
+    return found("ok", "".join(re.findall(r"release [\d.]+", run_command(["nvcc", "--version"]))))
 
 
 def _exchange(device: str) -> dict[str, Any]:
-    """Let two processes render together."""
     port = _free_port()
     with ThreadPoolExecutor(2) as pool:
         parts = list(pool.map(lambda rank: probe("exchange", device, rank, port), "01"))

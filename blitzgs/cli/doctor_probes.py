@@ -39,20 +39,22 @@ def torch_() -> dict[str, Any]:
     import torch
 
     gpus = range(torch.cuda.device_count() if torch.cuda.is_available() else 0)
+
+    def gpu(i: int) -> dict[str, Any]:
+        free, total = torch.cuda.mem_get_info(i)
+        return {
+            "name": torch.cuda.get_device_name(i),
+            "architecture": "sm_{}{}".format(*torch.cuda.get_device_capability(i)),
+            "bytes": total,
+            "free_bytes": free,
+            "peers": [j for j in gpus if j != i and torch.cuda.can_device_access_peer(i, j)],
+        }
+
     return {
         "version": torch.__version__,
         "cuda": torch.version.cuda,
         "threads": torch.get_num_threads(),
-        "gpus": [
-            {
-                "name": torch.cuda.get_device_name(i),
-                "architecture": "sm_{}{}".format(*torch.cuda.get_device_capability(i)),
-                "bytes": torch.cuda.mem_get_info(i)[1],
-                "free_bytes": torch.cuda.mem_get_info(i)[0],
-                "peers": [j for j in gpus if j != i and torch.cuda.can_device_access_peer(i, j)],
-            }
-            for i in gpus
-        ],
+        "gpus": list(map(gpu, gpus)),
         "nccl": ".".join(map(str, torch.cuda.nccl.version())) if len(gpus) else None,
     }
 
@@ -77,9 +79,7 @@ def library(name: str, *architectures: str) -> dict[str, Any]:
     torch.ops.load_library(str(path))
     ops = _built.schema_digest(path)
     if _built.REGISTRATION.exists() and ops != _built.source_digest(_built.REGISTRATION):
-        raise ImportError(
-            f"{path} was built before the ops changed (it does not match csrc/registration.cpp)"
-        )
+        raise ImportError(f"{path} was built before the ops changed (csrc/registration.cpp is another)")
     if name == "cpu":
         return found("ok", text, sha256=digest, ops=ops)
     build = ctypes.CDLL(str(path)).blitzgs_cuda_build
@@ -94,9 +94,8 @@ def library(name: str, *architectures: str) -> dict[str, Any]:
 
 def foreign(built: str, architectures: Sequence[str]) -> list[str]:
     """Return the architectures that a library was not built for, of GPUs such as "sm_90"."""
-    if built == "native":
-        return []
-    return [name for name in architectures if name.removeprefix("sm_") not in re.split(r"\D+", built)]
+    known = architectures if built == "native" else {f"sm_{number}" for number in re.findall(r"\d+", built)}
+    return [name for name in architectures if name not in known]
 
 
 def render(device: str) -> dict[str, Any]:
@@ -108,21 +107,18 @@ def render(device: str) -> dict[str, Any]:
     tensors = [tensor.to(device).requires_grad_() for tensor in _scene()]
     viewmat, K = (tensor.to(device) for tensor in _camera(0))
     begin = time.perf_counter()
-    images = _rendered(tensors, viewmat, K, False)
+    image = _rendered(tensors, viewmat, K, False)[0].double().cpu()
     leaves = [tensor.double().requires_grad_() for tensor in _scene()]
     by_definition: Any = render_reference
     reference = by_definition(*leaves, *_camera(0), _WIDTH, _HEIGHT, sh_degree=1)
-    weights = torch.randn(reference.image.shape, generator=_generator(), dtype=torch.float64)
+    weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     weights[reference.cut] = 0  # where rounding decides whether a Gaussian counts
-    (images[0].double().cpu() * weights).sum().backward()
-    (reference.image * weights).sum().backward()
-    image = (images[0].detach().double().cpu() - reference.image.detach()).abs()
-    gradients = []
-    for ours, exact in zip(tensors, leaves, strict=True):
-        assert ours.grad is not None and exact.grad is not None
-        gradients.append((ours.grad.double().cpu() - exact.grad).abs().max() / exact.grad.abs().max())
+    ours = torch.autograd.grad((image * weights).sum(), tensors)
+    exact = torch.autograd.grad((reference.image * weights).sum(), leaves)
+    gradients = [(a.double().cpu() - b).abs().max() / b.abs().max() for a, b in zip(ours, exact, strict=True)]
     seconds = time.perf_counter() - begin
-    return rendered(float(image[~reference.cut].max()), float(max(gradients)), seconds)
+    error = (image - reference.image).detach().abs()[~reference.cut].max()
+    return rendered(float(error), float(max(gradients)), seconds)
 
 
 def rendered(image_error: float, gradient_error: float, seconds: float) -> dict[str, Any]:
@@ -166,9 +162,7 @@ def nccl(port: str) -> dict[str, Any]:
     torch.distributed.all_reduce(values)
     total = float(values.sum())
     torch.distributed.destroy_process_group()
-    if total != 28.0:
-        return found("failed", "one GPU: a wrong sum")
-    return found("ok", "one GPU: it sums")
+    return found("ok", "one GPU: it sums") if total == 28.0 else found("failed", "one GPU: a wrong sum")
 
 
 def disk(folder: str) -> dict[str, Any]:
@@ -201,17 +195,11 @@ def measured(folder: str, write_mb_s: float, read_mb_s: float) -> dict[str, Any]
     return found(state, text, remedy, write_mb_s=write_mb_s, read_mb_s=read_mb_s, free_bytes=free_bytes)
 
 
-def _generator() -> Any:
-    import torch
-
-    return torch.Generator().manual_seed(4)
-
-
 def _scene() -> list[Tensor]:
     """Return the means, quats, scales, opacities and SH coefficients of some Gaussians, float32."""
     import torch
 
-    generator = _generator()
+    generator = torch.Generator().manual_seed(4)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
         return low + (high - low) * torch.rand(_COUNT, *shape, generator=generator)
@@ -229,7 +217,6 @@ def _camera(number: int) -> tuple[Tensor, Tensor]:
 
 
 def _rendered(scene: list[Tensor], viewmat: Tensor, K: Tensor, distributed: bool) -> Tensor:
-    """Return an image [1, H, W, 3]."""
     import blitzgs
 
     render: Any = blitzgs.rasterization

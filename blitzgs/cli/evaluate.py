@@ -8,7 +8,18 @@ import json
 import sys
 from pathlib import Path
 
-from blitzgs.cli import arguments
+from blitzgs.cli.arguments import (
+    DATA,
+    DEVICES,
+    MODEL,
+    POOL,
+    SPLIT,
+    Commands,
+    Types,
+    add_command,
+    chosen_views,
+    number,
+)
 from blitzgs.config.files import changed
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.models import read_gaussians
@@ -36,7 +47,7 @@ photograph.
 """
 
 
-FLAGS = """
+ARGUMENTS = f"""{MODEL}{DATA}{DEVICES}{POOL}{SPLIT}
 --downscale N  with FILE: reduce both sides of the photographs by this factor, as data.downscale
 --out DIR  folder for the results (default: RUN/evaluation/SPLIT, or FILE.evaluation/SPLIT)
 --pictures N  number of pictures that show a render, its photograph and its error (default: %(default)s)
@@ -44,20 +55,18 @@ FLAGS = """
     [1, 3, H, W] in [-1, 1], and returns their distance
 --allow-missing  leave out views whose photograph is missing
 """
-_COUNT = arguments.number(int, lambda value: value >= 0, "0 or more")
-_FACTOR = arguments.number(int, lambda value: value >= 1, "a whole number from 1 on")
+TYPES: Types = {
+    "--downscale": number(int, lambda value: value >= 1, "a whole number from 1 on"),
+    "--pictures": number(int, lambda value: value >= 0, "0 or more"),
+    "--lpips": str,
+}
 
 
-def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) -> None:
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = arguments.add_command(commands, "eval", run, summary, HELP)
-    arguments.add_model(parser)
-    arguments.add_capture(parser)
-    arguments.add_device(parser, shares_gpus=True)
-    arguments.add_pool(parser)
-    arguments.add_split(parser, "measure")
-    arguments.add_flags(parser, FLAGS, {"--downscale": _FACTOR, "--pictures": _COUNT, "--lpips": str})
-    parser.set_defaults(pictures=8)
+    add_command(
+        commands, "eval", run, summary, HELP, ARGUMENTS, TYPES, device="auto", split="test", pictures=8
+    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -91,7 +100,7 @@ def run(args: argparse.Namespace) -> None:
                 warn_of_changes(run_folder, capture)
             subject = model.subject(ranks)
             folder = args.out or run_folder / run_files.EVALUATION / args.split
-        indices = arguments.chosen_views(args.split, capture, path)
+        indices = chosen_views(args.split, capture, path)
         with image_progress("Comparing", ranks.rank == 0) as report:
             result = evaluate(
                 subject,

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from blitzgs.cli import arguments
+from blitzgs.cli.arguments import DATA, DEVICE, MODEL, Commands, Types, add_arguments, add_command, number
 from blitzgs.cli.view import photographs
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import GaussianSource, check_memory, is_antialiased, triple_of
@@ -37,7 +37,7 @@ from blitzgs.runs.run_files import run_and_checkpoint
 from blitzgs.runs.source import Watched, open_source, source_of, up_of_run
 from blitzgs.runs.world import in_world, load_world_frame
 from blitzgs.util.output import write_file
-from blitzgs.util.progress import ending_by_exception, image_progress
+from blitzgs.util.progress import Report, ending_by_exception, image_progress
 
 # Default of --max-mb, and the largest file whose text browsers still hold in one piece.
 MAX_MB, LARGEST_MB = 50, 500
@@ -81,19 +81,24 @@ A city that no browser holds at once is written as a folder that viewers load pi
 Memory does not grow with a run or a PLY file; the disk needs two and a half times the size of the model.
 See docs/guide/formats.md.
 """
-FOLDERS = """
+KINDS = "\n".join(f"--{name} FILE  {found.title} file to write" for name, found in FORMATS.items())
+KINDS += """
 --html FILE  HTML file to write
 --tiles DIR  folder to make for 3D Tiles (tileset.json)
 --streamed-sog DIR  folder to make for streamed SOG (lod-meta.json)
 """
-FLAGS = f"""
+ARGUMENTS = f"""{MODEL}{DEVICE}{DATA}
 --max-mb MB  with --html: largest size of the file in megabytes (default: {MAX_MB})
 --classic  for viewers without antialiasing: write opacities that make up for it
 --spz-tiles  with --tiles: SPZ inside the tiles, for CesiumJS, and no page
 --tile-gaussians N  with --tiles and --streamed-sog: Gaussians of a tile (default: 32768)
 --processes N  with --tiles and --streamed-sog: processes that write tiles (default: as many as CPU cores)
-"""
-SELECTION = """
+--coordinates {"|".join(COORDINATES)}|world  capture: the capture's coordinates; centred: relative to the
+    model's origin; auto: the capture's if float32 can hold them; world: those of RUN/geo.json (`blitzgs
+    align`), as auto (default: auto)
+--clean [K=1]  leave out floaters and fringes that at most K training photographs saw (default: %(const)s)
+--sh-degree 0|1|2|3  write at most this SH degree
+--crop-axes xy|xz|yz  axes of the polygon's corners (default: xy)
 --crop-polygon FILE  keep this region: a GeoJSON polygon, or lines "x y", in the coordinates of --crop
 --min-opacity O  keep Gaussians of at least this opacity
 --most N  keep the N Gaussians that contribute most to views of the capture (of a file, and in tiles and
@@ -101,41 +106,22 @@ SELECTION = """
 --levels FIRST-LAST  keep these octree levels, for example 0-3
 """
 _TILES = "--tiles and --streamed-sog"
-_COUNT = arguments.number(int, lambda value: value >= 1, "a whole number from 1 on")
-_OPACITY = arguments.number(float, lambda value: 0 <= value < 1, "from 0 to below 1")
-_MB = arguments.number(float, lambda mb: 0 < mb <= LARGEST_MB, f"a number of megabytes up to {LARGEST_MB}")
 
 
-def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) -> None:
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = arguments.add_command(commands, "export", run, summary, HELP)
-    arguments.add_model(parser)
-    arguments.add_device(parser)
-    arguments.add_capture(parser)
-    kind = parser.add_mutually_exclusive_group(required=True)
-    for name, found in FORMATS.items():
-        arguments.add_path(kind, f"--{name}", "FILE", f"{found.title} file to write")
-    arguments.add_flags(kind, FOLDERS)
-    arguments.add_flags(parser, FLAGS, {"--max-mb": _MB, "--tile-gaussians": _COUNT, "--processes": _COUNT})
-    parser.add_argument(
-        "--coordinates",
-        choices=(*COORDINATES, "world"),
-        help="capture: the capture's coordinates; centred: relative to the model's origin; auto: the "
-        "capture's if float32 can hold them; world: those of RUN/geo.json (`blitzgs align`), as auto "
-        "(default: auto)",
-    )
-    parser.add_argument(
-        "--clean",
-        type=_COUNT,
-        nargs="?",
-        const=1,
-        metavar="K",
-        help="leave out floaters and fringes that at most K training photographs saw (default: %(const)s)",
-    )
-    _add_selection(parser)
-
-
-def _add_selection(parser: argparse.ArgumentParser) -> None:
+    count = number(int, lambda value: value >= 1, "a whole number from 1 on")
+    types: Types = {
+        **dict.fromkeys(("--tile-gaussians", "--processes", "--most", "--clean"), count),
+        "--max-mb": number(
+            float, lambda mb: 0 < mb <= LARGEST_MB, f"a number of megabytes up to {LARGEST_MB}"
+        ),
+        "--min-opacity": number(float, lambda value: 0 <= value < 1, "from 0 to below 1"),
+        "--levels": _levels,
+        "--sh-degree": int,
+    }
+    parser = add_command(commands, "export", run, summary, HELP, ARGUMENTS, types, device="auto")
+    add_arguments(parser.add_mutually_exclusive_group(required=True), KINDS)
     parser.add_argument(
         "--crop",
         type=float,
@@ -143,11 +129,6 @@ def _add_selection(parser: argparse.ArgumentParser) -> None:
         metavar=tuple("xyzXYZ"),
         help="keep this box, in the capture's coordinates (with --coordinates world: the world's)",
     )
-    parser.add_argument(
-        "--crop-axes", choices=("xy", "xz", "yz"), help="axes of the polygon's corners (default: xy)"
-    )
-    parser.add_argument("--sh-degree", type=int, choices=range(4), help="write at most this SH degree")
-    arguments.add_flags(parser, SELECTION, {"--min-opacity": _OPACITY, "--most": _COUNT, "--levels": _levels})
 
 
 def run(args: argparse.Namespace) -> None:
@@ -165,7 +146,6 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _refuse(args: argparse.Namespace, flags: Iterable[str], reason: str) -> None:
-    """Raise an error if one of some flags is given."""
     for flag in flags:
         if getattr(args, flag):
             raise ValueError(f"--{flag.replace('_', '-')} {reason}")
@@ -190,9 +170,7 @@ def _export_tiles(args: argparse.Namespace, selection: Selection | None) -> None
         def write_streamed(folder: Path, found: GaussianSource) -> None:
             done.append(write_streamed_sog(folder, found, most, processes, report))
 
-        source = Watched(source, report)
-        if selection is not None:
-            source = Selected(source, selection, (x, y, z))
+        source = _chosen(source, report, selection, (x, y, z))
         if args.tiles:
             place = city.transform(), city.scene, city.title
             done.append(write_tiles(path, source, *place, most, processes, report, args.spz_tiles))
@@ -248,9 +226,7 @@ def _export_file(args: argparse.Namespace) -> None:
             raise ValueError(f"{path} is the model itself, which would be lost: choose another name")
         source = open_gaussians(args.model, checked=selection is None)
         with image_progress("Exporting", unit="Gaussians") as report:
-            source = Watched(source, report)
-            if selection is not None:
-                source = Selected(source, selection, offset_of(source.comments))
+            source = _chosen(source, report, selection, offset_of(source.comments))
             written = export_file(source, kind, path)
     else:
         source, written = _export_run(args, kind, path, selection)
@@ -271,9 +247,7 @@ def _export_run(
     opened = open_source(run_folder, checkpoint)
     if not in_memory:
         with image_progress("Exporting", unit="Gaussians") as report:
-            source: GaussianSource = Watched(opened, report)
-            if selection is not None:
-                source = Selected(source, selection, opened.space.offset)
+            source = _chosen(opened, report, selection, opened.space.offset)
             return source, export(source, opened.space, kind, path, coordinates)
     flags = "--classic, --clean, --most and --coordinates world need the model in memory"
     # The model is read with the optimiser's two moments, and copied.
@@ -289,26 +263,31 @@ def _export_run(
         if args.clean is not None:
             kept = _cleaned(model, run_folder, args, path, ranks)
         if args.classic and not model.config.model.antialiased:
-            print(
-                "--classic changes nothing: the model was trained without model.antialiased", file=sys.stderr
-            )
+            text = "--classic changes nothing: the model was trained without model.antialiased"
+            print(text, file=sys.stderr)
         elif args.classic:
-            print(
-                "antialiasing is baked into the opacities: right at the training views' distance, else nearly"
-            )
+            right = "right at the training views' distance, else nearly"
+            print(f"antialiasing is baked into the opacities: {right}")
             stored = folder.cameras()
             model = without_antialiasing(model, [stored.cameras[index] for index in stored.train])
         crs, up = None, up_of_run(run_folder, model.space)
         if coordinates == "world":
             frame = load_world_frame(run_folder)
             if frame is None:
-                raise FileNotFoundError(
-                    f"{run_folder} has no geo.json, so its place in the world is unknown: use blitzgs align"
-                )
+                lacks = "has no geo.json, so its place in the world is unknown"
+                raise FileNotFoundError(f"{run_folder} {lacks}: use blitzgs align")
             model, crs, coordinates = in_world(model, frame), frame.crs, "auto"
             up = frame.rotation @ up
     source = Selected(source_of(model, up), selection or Selection(), model.space.offset, kept, score)
     return source, export(source, model.space, kind, path, coordinates, crs)
+
+
+def _chosen(
+    source: GaussianSource, report: Report, selection: Selection | None, offset: tuple[float, float, float]
+) -> GaussianSource:
+    """Return what the flags choose of a source, whose reading is reported."""
+    watched = Watched(source, report)
+    return watched if selection is None else Selected(watched, selection, offset)
 
 
 def _cleaned(model: Model, folder: Path, args: argparse.Namespace, path: Path, ranks: Ranks) -> torch.Tensor:
@@ -316,11 +295,10 @@ def _cleaned(model: Model, folder: Path, args: argparse.Namespace, path: Path, r
     cameras = open_run(folder).cameras()
     found = cleaned(model, cameras, args.clean, ranks, photographs(folder, args.data))
     picture = path.with_name(path.name + ".clean.jpg")
-    gone, shown = len(model) - int(found.kept.sum()), ""
     if found.picture is not None:
         write_file(picture, found.picture)
-        shown = f", see {picture}"
-    print(f"--clean: {gone:,} of {len(model):,} Gaussians go{shown}")
+    shown = "" if found.picture is None else f", see {picture}"
+    print(f"--clean: {len(model) - int(found.kept.sum()):,} of {len(model):,} Gaussians go{shown}")
     if found.psnr is not None:
         before, after = found.psnr
         print(f"held-out PSNR: {before:.3f} dB before, {after:.3f} dB after")
@@ -340,10 +318,11 @@ def _selection(args: argparse.Namespace) -> Selection | None:
     box = None if args.crop is None else np.array(args.crop).reshape(2, 3)
     if box is not None and not (box[0] < box[1]).all():
         raise ValueError(f"--crop takes the least x y z, then the largest, got {args.crop}")
+    first, second = args.crop_axes or "xy"
     return Selection(
         box=box,
         polygon=None if args.crop_polygon is None else read_polygon(args.crop_polygon),
-        axes=("xyz".index((args.crop_axes or "xy")[0]), "xyz".index((args.crop_axes or "xy")[1])),
+        axes=("xyz".index(first), "xyz".index(second)),
         min_opacity=args.min_opacity or 0.0,
         levels=args.levels,
         sh_degree=args.sh_degree,

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_path, number
+from blitzgs.cli.arguments import DATA, DEVICES, Commands, add_command, number
 from blitzgs.config.fields import ScheduleConfig
 from blitzgs.config.files import changed
 from blitzgs.config.schedule import Schedule
@@ -17,8 +17,8 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.runs import run_files
 from blitzgs.runs.folder import open_run
 from blitzgs.spawn import fit as gate_fit
-from blitzgs.spawn import samples as spawn_samples
 from blitzgs.spawn.gate import SpawnGate, gate_file
+from blitzgs.spawn.samples import MAX_ROWS, SUFFIX, read_sample, write_sample
 from blitzgs.training.inputs import open_capture
 from blitzgs.training.replay import FIGURES, TABLE, replay
 from blitzgs.util.output import OutputFolder
@@ -37,60 +37,55 @@ all births and deaths of Gaussians. The repository's docs/guide/fewer-gaussians.
 """
 
 
+FIT = """
+runs RUN...  folder of a run with lineage, or a sample
+--out FILE  file for the gate, .json (required)
+--gate-from IMAGES  also evaluate separately the spawns (births during training) from this time on; take
+    schedule.gate_from times schedule.scale of the runs that will use the gate (default: %(default)s)
+"""
+SAMPLE = """
+folder RUN  folder of a run with lineage
+--out FILE  file for the sample, .parquet (required)
+--rows N  approximate number of births in the file (default: %(default)s)
+"""
+EVALUATE = """
+gate GATE  file of a gate, or "default" (the included one)
+runs RUN...  folder of a run with lineage
+--out DIR  folder for figures and maps (required)
+"""
+REPLAY = f"""{DATA}{DEVICES}
+gate GATE  file of a gate, or "default" (the included one)
+folder RUN  folder of a run with lineage
+--out DIR  folder for these runs and their figures (required)
+--rate RATE  share of the candidates to withhold (default: %(default)s)
+"""
+
+
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
+    types = {
+        "gate": gate_file,
+        "--gate-from": number(float, lambda value: value >= 0, "0 or more"),
+        "--rows": number(int, lambda value: value >= 1, "at least 1"),
+        "--rate": number(float, lambda value: 0 <= value <= 1, "in [0, 1]"),
+    }
     parser = add_command(commands, "gate", lambda _: 2, summary, HELP)
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    fit = add_command(actions, "fit", run_fit, "fit a gate on the lineage of runs")
-    add_path(fit, "runs", "RUN", "folder of a run with lineage, or a sample", nargs="+")
-    add_path(fit, "--out", "FILE", "file for the gate, .json", required=True)
-    fit.add_argument(
-        "--gate-from",
-        type=number(float, lambda value: value >= 0, "0 or more"),
-        default=ScheduleConfig.gate_from,
-        metavar="IMAGES",
-        help="also evaluate separately the spawns (births during training) from this time on; take "
-        "schedule.gate_from times schedule.scale of the runs that will use the gate (default: %(default)s)",
-    )
-    sample = add_command(actions, "sample", run_sample, "reduce the lineage of a run to one file")
-    add_path(sample, "folder", "RUN", "folder of a run with lineage")
-    add_path(sample, "--out", "FILE", "file for the sample, .parquet", required=True)
-    text = "approximate number of births in the file (default: %(default)s)"
-    count = number(int, lambda value: value >= 1, "at least 1")
-    sample.add_argument("--rows", type=count, default=spawn_samples.MAX_ROWS, metavar="N", help=text)
-    judge = add_command(actions, "evaluate", run_evaluate, "measure a gate on the lineage of runs")
-    _add_gate(judge)
-    add_path(judge, "runs", "RUN", "folder of a run with lineage", nargs="+")
-    add_path(judge, "--out", "DIR", "folder for figures and maps", required=True)
-    again = add_command(
-        actions,
-        "replay",
-        run_replay,
-        "continue one checkpoint several times: without a gate, with it, with an oracle, with random vetoes",
-    )
-    _add_gate(again)
-    add_path(again, "folder", "RUN", "folder of a run with lineage")
-    add_path(again, "--out", "DIR", "folder for these runs and their figures", required=True)
-    text = "share of the candidates to withhold (default: %(default)s)"
-    share = number(float, lambda value: 0 <= value <= 1, "in [0, 1]")
-    again.add_argument("--rate", type=share, default=0.6, metavar="RATE", help=text)
-    add_capture(again)
-    add_device(again, shares_gpus=True)
-
-
-def _add_gate(parser: argparse.ArgumentParser) -> None:
-    text = 'file of a gate, or "default" (the included one)'
-    parser.add_argument("gate", type=gate_file, metavar="GATE", help=text)
+    again = "continue one checkpoint several times: without a gate, with it, an oracle and random vetoes"
+    for name, function, what, text, defaults in (
+        ("fit", run_fit, "fit a gate on the lineage of runs", FIT, {"gate_from": ScheduleConfig.gate_from}),
+        ("sample", run_sample, "reduce the lineage of a run to one file", SAMPLE, {"rows": MAX_ROWS}),
+        ("evaluate", run_evaluate, "measure a gate on the lineage of runs", EVALUATE, {}),
+        ("replay", run_replay, again, REPLAY, {"rate": 0.6, "device": "auto"}),
+    ):
+        add_command(actions, name, function, what, None, text, types, **defaults)
 
 
 def run_fit(args: argparse.Namespace) -> None:
     """Fit a gate."""
     if args.out.suffix != ".json":
         raise ValueError(f"--out {args.out}: a gate's file ends in .json")
-    runs = [
-        spawn_samples.read_sample(path) if path.suffix == spawn_samples.SUFFIX else _spawns_of(path)
-        for path in args.runs
-    ]
+    runs = [(read_sample if path.suffix == SUFFIX else _spawns_of)(path) for path in args.runs]
     args.out.parent.mkdir(parents=True, exist_ok=True)
     figures = gate_fit.fit(runs, args.out, args.gate_from)
     print(f"{args.out}: fitted on {len(runs)} run{'s' * (len(runs) > 1)}; {figures['protocol']}:")
@@ -100,11 +95,11 @@ def run_fit(args: argparse.Namespace) -> None:
 
 def run_sample(args: argparse.Namespace) -> None:
     """Write a sample of spawns."""
-    if args.out.suffix != spawn_samples.SUFFIX:
-        raise ValueError(f"--out {args.out}: a sample's file ends in {spawn_samples.SUFFIX}")
+    if args.out.suffix != SUFFIX:
+        raise ValueError(f"--out {args.out}: a sample's file ends in {SUFFIX}")
     run = _spawns_of(args.folder)
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    rate = spawn_samples.write_sample(run, args.out, args.rows)
+    rate = write_sample(run, args.out, args.rows)
     print(f"{args.out}: {rate:.2%} of {len(run.survived):,} spawns of {run.name}")
 
 
@@ -123,8 +118,7 @@ def run_evaluate(args: argparse.Namespace) -> None:
     for result in results:
         seen = "  (the gate was fitted on this scene)" if result["seen"] else ""
         r = result.get("regions", {}).get("r")
-        regions = "" if r is None else f"; regions r {r:.2f}"
-        print(_judgement(result) + regions + seen)
+        print(_judgement(result) + ("" if r is None else f"; regions r {r:.2f}") + seen)
     print(f"{args.out}: {figures.name}, {gate_fit.SURVIVAL} and maps of regions")
 
 
@@ -156,8 +150,9 @@ def _spawns_of(folder: Path) -> gate_fit.Spawns:
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is not the folder of a run")
     lineage = folder / run_files.LINEAGE
-    summary = open_run(folder).summary() if lineage.is_dir() else {}
-    if lineage.is_dir() and not summary:
+    if not lineage.is_dir():
+        return gate_fit.read_spawns(lineage)  # which says what is missing
+    if not (summary := open_run(folder).summary()):
         raise ValueError(
             f"{folder} is not finished (it has no {run_files.SUMMARY}), so it is not known which Gaussians "
             "survive; finish it with blitzgs train ... --resume"

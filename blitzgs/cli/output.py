@@ -15,9 +15,8 @@ from typing import Any, TextIO
 class Output(io.FileIO):
     """One of the process's output streams, which keeps the program running when it cannot be written."""
 
-    def __init__(self, title: str, descriptor: int) -> None:
+    def __init__(self, descriptor: int) -> None:
         super().__init__(descriptor, "w", closefd=False)
-        self.title = title  # "standard output" or "standard error"
         self.lost: str | None = None  # why text was lost; None: all was written
         # False: the reader has gone (a pipe that `head` closed, a terminal that hung up).
         self.has_reader = True
@@ -47,7 +46,7 @@ def surviving_output() -> Iterator[dict[str, Output]]:
     """
     outputs: dict[str, Output] = {}
     previous: dict[str, TextIO | None] = {}
-    for name, title in (("stdout", "standard output"), ("stderr", "standard error")):
+    for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:  # the process was started without it
             previous[name] = None
@@ -62,7 +61,7 @@ def surviving_output() -> Iterator[dict[str, Output]]:
         with contextlib.suppress(OSError):
             stream.flush()
         previous[name] = stream
-        outputs[name] = Output(title, stream.fileno())
+        outputs[name] = Output(stream.fileno())
         text = io.TextIOWrapper(
             io.BufferedWriter(outputs[name]),
             stream.encoding,
@@ -92,14 +91,9 @@ def report_lost(given: list[str], outputs: dict[str, Output]) -> int:
     """
     for name in outputs:
         getattr(sys, name).flush()
-    lost = [output for output in outputs.values() if output.lost and output.has_reader]
-    for output in lost:
-        print(
-            f"blitzgs: {output.title} cannot be written ({output.lost}): what was printed there is "
-            "incomplete; files are complete",
-            file=sys.stderr,
-        )
-    return int(
-        any(output.title == "standard output" for output in lost)
-        and any(text.partition("=")[0] in _PRINTING for text in given)
-    )
+    lost = {name: output.lost for name, output in outputs.items() if output.lost and output.has_reader}
+    for name, reason in lost.items():
+        title = {"stdout": "standard output", "stderr": "standard error"}[name]
+        text = f"blitzgs: {title} cannot be written ({reason}): what was printed there is incomplete"
+        print(f"{text}; files are complete", file=sys.stderr)
+    return int("stdout" in lost and any(text.partition("=")[0] in _PRINTING for text in given))

@@ -22,8 +22,7 @@ from torch import Tensor
 from blitzgs.capture.cameras import camera_centres
 from blitzgs.capture.pictures import encode_image, to_uint8
 from blitzgs.capture.usable import read_cameras
-from blitzgs.cli import arguments
-from blitzgs.cli.arguments import chosen_views
+from blitzgs.cli.arguments import DEVICES, MODEL, POOL, SPLIT, Commands, add_command, chosen_views, number
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files, trained_model
@@ -47,7 +46,7 @@ _DEPTH = (
     "depth in the capture's unit = value * scale; 0: nothing is there; 65535: this far or farther. The depth "
     "is along the axis of view, the mean of what a pixel shows."
 )
-_POSITIVE = arguments.number(float, lambda value: 0 < value < 1e6, "a positive number")
+_POSITIVE = number(float, lambda value: 0 < value < 1e6, "a positive number")
 
 HELP = """\
 Render views of a model to pictures, or a camera path to a film:
@@ -63,7 +62,9 @@ program (PLY, compressed PLY, SPZ, SOG, .splat). Films need the package av: pip 
 """
 
 
-FLAGS = """
+ARGUMENTS = f"""{MODEL}{DEVICES}{POOL}{SPLIT}
+--data DIR  read the cameras anew from this capture, that of the run (of others: --cameras)
+--out DIR|FILE  folder for pictures, or FILE{SUFFIX} (required)
 --cameras FILE  render the cameras of this transforms file or folder of a COLMAP model, in the capture's
     coordinates; no photographs are needed
 --path NAME|FILE  render the frames of a camera path: a file, or orbit (around the scene), flight (across it)
@@ -80,17 +81,10 @@ FLAGS = """
 """
 
 
-def add_to(commands: arguments.Commands[argparse.ArgumentParser], summary: str) -> None:
+def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = arguments.add_command(commands, "render", run, summary, HELP)
-    arguments.add_model(parser)
-    text = "--data DIR  read the cameras anew from this capture, that of the run (of others: --cameras)"
-    arguments.add_flags(parser, text)
-    arguments.add_device(parser, shares_gpus=True)
-    arguments.add_pool(parser)
-    arguments.add_split(parser, "render")
-    arguments.add_path(parser, "--out", "DIR|FILE", f"folder for pictures, or FILE{SUFFIX}", required=True)
-    arguments.add_flags(parser, FLAGS, {"--size": _size, "--fps": _POSITIVE, "--seconds": _POSITIVE})
+    types = {"--size": _size, "--fps": _POSITIVE, "--seconds": _POSITIVE}
+    add_command(commands, "render", run, summary, HELP, ARGUMENTS, types, device="auto", split="test")
 
 
 _OTHER_FILES = (".gif", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".webp", ".png", ".jpg", ".jpeg")
@@ -99,18 +93,17 @@ _OTHER_FILES = (".gif", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".webp", ".png"
 def run(args: argparse.Namespace) -> None:
     """Render views."""
     film = _film(args)
-    is_film = args.out.suffix.lower() == SUFFIX
+    is_film = film is not None and args.out.suffix.lower() == SUFFIX
     if film is not None and is_film:
         check_film(args.out, film.width, film.height)
     with Ranks.from_environment(args.device, share_gpus=args.share_gpus) as ranks:
         opened = open_rendered(args, film, ranks)
-        if is_film and film is not None:
+        if film is not None and is_film:
             _render_film(args.out, opened, film, ranks)
         else:
             _render_pictures(args, opened, ranks)
         if ranks.rank == 0:
-            count, what = len(opened.indices), "frames" if is_film else "images"
-            print(f"{args.out}: {count} {what}")
+            print(f"{args.out}: {len(opened.indices)} {'frames' if is_film else 'images'}")
 
 
 def _film(args: argparse.Namespace) -> Film | None:
@@ -172,7 +165,6 @@ def _render_pictures(args: argparse.Namespace, opened: Rendered, ranks: Ranks) -
     modes: list[Mode] = [mode for mode in MEASURED if getattr(args, mode)]
     paths = {mode: output.paths(names, f".{mode}{suffix}") for mode in modes}
     colours = output.paths(names, suffix)
-    args.out.mkdir(parents=True, exist_ok=True)
     step = _depth_step(opened)
     if "depth" in modes and not args.raw and ranks.rank == 0:
         scale = json.dumps({"scale": step, "meaning": _DEPTH}, indent=1) + "\n"
@@ -191,8 +183,7 @@ def _render_pictures(args: argparse.Namespace, opened: Rendered, ranks: Ranks) -
                 camera = opened.cameras[index]
                 pose = viewmat(camera, opened.subject.space)
                 look = Look(pose, np.asarray(camera.K), camera.width, camera.height, mode)
-                picture = drawer.draw(look) if drawer else None
-                if picture is not None:
+                if drawer is not None and (picture := drawer.draw(look)) is not None:
                     values = picture.values.astype(np.float32)
                     full = 65535.0 if mode == "alpha" else 1 / step
                     output.write(paths[mode][index], _npy(values) if args.raw else _png16(values * full))
@@ -262,6 +253,7 @@ def open_rendered(args: argparse.Namespace, film: Film | None, ranks: Ranks) -> 
         box, up = _shared_box(model.table, ranks), None
         stored = _stored_cameras(args, folder, model, ranks)
         subject = model.subject(ranks)
+    inputs = stored.inputs if stored else []
     cameras: Sequence[CameraLike]
     if args.cameras is not None:
         cameras = read_cameras(args.cameras, np.array(subject.space.offset))
@@ -270,10 +262,9 @@ def open_rendered(args: argparse.Namespace, film: Film | None, ranks: Ranks) -> 
     elif stored is not None:
         shown = _exposures(exposures, stored) if args.exposure else {}
         indices = chosen_views(args.split, stored, args.model)
-        return Rendered(subject, box, stored.cameras, indices, stored.inputs, shown)
+        return Rendered(subject, box, stored.cameras, indices, inputs, shown)
     else:
         raise ValueError(f"{args.model} has no cameras: use --path, --cameras or the folder of a run")
-    inputs = stored.inputs if stored else []
     return Rendered(subject, box, cameras, range(len(cameras)), inputs, {})
 
 

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from blitzgs.cli.arguments import Commands, add_command, add_flags, add_path, add_run
+from blitzgs.cli.arguments import RUN, Commands, add_command
 from blitzgs.runs import run_files
 from blitzgs.util.errors import printable, warn
 
@@ -22,9 +22,8 @@ for example after blitzgs eval.
 
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "report", run, summary, HELP)
-    add_run(parser)
-    add_flags(parser, "--out FILE  the file (default: RUN/report.html)")
+    text = f"{RUN}--out FILE  the file (default: RUN/report.html)"
+    add_command(commands, "report", run, summary, HELP, text)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -66,9 +65,8 @@ metrics of each view, curves, and pictures of the same views. The others are com
 
 def add_compare(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "compare", run_compare, summary, COMPARE_HELP)
-    add_path(parser, "folders", "RUN", "folders of two runs or more", nargs="+")
-    add_path(parser, "--out", "FILE", "the file (default: %(default)s)", default=Path("compare.html"))
+    text = "folders RUN...  folders of two runs or more\n--out FILE  the file (default: %(default)s)"
+    add_command(commands, "compare", run_compare, summary, COMPARE_HELP, text, out=Path("compare.html"))
 
 
 def run_compare(args: argparse.Namespace) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from blitzgs.capture.colmap import camera_models, find_models
 from blitzgs.capture.transforms import find_transforms
-from blitzgs.cli.arguments import Commands, add_command, add_path
+from blitzgs.cli.arguments import Commands, add_command
 from blitzgs.config.fields import Config
 from blitzgs.config.files import changed
 from blitzgs.runs.run_files import CONFIG
@@ -41,17 +41,17 @@ photographs without a pose and why), and COLMAP's database and messages.
 """
 
 
+ARGUMENTS = f"""
+photos PHOTOS  folder of the photographs
+capture CAPTURE  folder to write
+--pairs {"|".join(PAIRS)}  which photographs are compared (default: see above)
+--mapper {"|".join(MAPPERS)}  how poses are found (default: see above)
+"""
+
+
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "sfm", run, summary, HELP)
-    add_path(parser, "photos", "PHOTOS", "folder of the photographs")
-    add_path(parser, "capture", "CAPTURE", "folder to write")
-    parser.add_argument(
-        "--pairs", choices=PAIRS, default="auto", help="which photographs are compared (default: see above)"
-    )
-    parser.add_argument(
-        "--mapper", choices=MAPPERS, default="auto", help="how poses are found (default: see above)"
-    )
+    parser = add_command(commands, "sfm", run, summary, HELP, ARGUMENTS, pairs="auto", mapper="auto")
     parser.add_argument(
         "--camera-model",
         choices=("auto", *(name for name in camera_models() if name != "EQUIRECTANGULAR")),
@@ -64,9 +64,8 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Reconstruct."""
-    find_poses(
-        photograph_folder(args.photos), args.capture, Settings(args.pairs, args.mapper, args.camera_model)
-    )
+    settings = Settings(args.pairs, args.mapper, args.camera_model)
+    find_poses(photograph_folder(args.photos), args.capture, settings)
     _print_next(args.capture)
 
 
@@ -88,19 +87,15 @@ def with_poses(config: Config, folder: Path) -> Config:
     They go into `folder`, which is used as it is if it is finished. Under torchrun rank 0 finds them and the
     others, which have not joined yet, wait for its report (UserError: a rank has failed meanwhile).
     """
-    photographs = _photographs_alone(config)
-    if photographs is None:
+    if (photographs := _photographs_alone(config)) is None:
         return config
-    first = os.environ.get("RANK", "0") == "0"
-    if is_finished(folder):
-        if first:
+    if os.environ.get("RANK", "0") == "0":
+        if is_finished(folder):
             print(f"poses: those of {folder}, found before (blitzgs sfm adds photographs)", file=sys.stderr)
-    elif first:
-        print(
-            f"{config.data.path} has photographs without poses: they are found first, into {folder}",
-            file=sys.stderr,
-        )
-        find_poses(photographs, folder, Settings())
+        else:
+            text = f"{config.data.path} has photographs without poses: they are found first, into {folder}"
+            print(text, file=sys.stderr)
+            find_poses(photographs, folder, Settings())
     while not is_finished(folder):
         from blitzgs.distributed.watchdog import early_failure
 
@@ -112,8 +107,7 @@ def with_poses(config: Config, folder: Path) -> Config:
 
 def understood_alone(config: Config) -> str | None:
     """Return what a training would do first with photographs that have no poses; None: they have."""
-    folder = _photographs_alone(config)
-    if folder is None:
+    if (folder := _photographs_alone(config)) is None:
         return None
     photographs = Photographs.of(folder)
     return (
@@ -131,9 +125,8 @@ def _photographs_alone(config: Config) -> Path | None:
     if not config.data.path or not has_photographs_alone(root, config.data.images):
         return None
     if (root / CONFIG).is_file():
-        raise FileNotFoundError(
-            f"{root} is a run and no capture: name the capture that its {CONFIG} has as data.path"
-        )
+        text = f"name the capture that its {CONFIG} has as data.path"
+        raise FileNotFoundError(f"{root} is a run and no capture: {text}")
     if find_models(root.parent) or find_transforms(root.parent):
         raise FileNotFoundError(
             f"{root} lies in a capture that has its cameras: --data={shlex.quote(str(root.parent))} (or find "
@@ -160,9 +153,8 @@ Where the median miss falls by less than a tenth, NEW has the model of CAPTURE.
 
 def add_refine(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "refine", run_refine, summary, REFINE_HELP)
-    add_path(parser, "capture", "CAPTURE", "folder of a capture with a COLMAP model")
-    add_path(parser, "new", "NEW", "folder to write")
+    text = "capture CAPTURE  folder of a capture with a COLMAP model\nnew NEW  folder to write"
+    add_command(commands, "refine", run_refine, summary, REFINE_HELP, text)
 
 
 def run_refine(args: argparse.Namespace) -> None:
@@ -173,10 +165,8 @@ def run_refine(args: argparse.Namespace) -> None:
 
 
 def _print_found(lines: list[str], begin: float) -> None:
-    print(
-        "\n".join(map(printable, [*lines, f"{'time:':15}{(time.monotonic() - begin) / 60:.1f} minutes"])),
-        flush=True,
-    )
+    for line in (*lines, f"{'time:':15}{(time.monotonic() - begin) / 60:.1f} minutes"):
+        print(printable(line), flush=True)
 
 
 def _print_next(capture: Path) -> None:

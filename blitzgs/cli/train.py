@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from blitzgs.capture.colmap import find_models
-from blitzgs.cli.arguments import Commands, add_command, add_device, add_flags, number
+from blitzgs.cli.arguments import DEVICES, Commands, Types, add_command, number
 from blitzgs.cli.report import write_final_report
 from blitzgs.cli.sfm import understood_alone, with_poses
 from blitzgs.config.fields import Config
@@ -50,7 +50,6 @@ from blitzgs.util.progress import Laps
 if TYPE_CHECKING:
     from blitzgs.viewer.live import Live
 
-_PORT = 8080
 # See `blitzgs.training.budget.extended`.
 _EXTENSION = number(
     float,
@@ -87,7 +86,7 @@ With torchrun's --max-restarts=K and --resume, a job that loses a process contin
 """
 
 
-FLAGS = """
+ARGUMENTS = f"""{DEVICES}
 --config RECIPE  name of a recipe, or a YAML file (default: aerial on a GPU, aerial_cpu on a CPU)
 --data DIR  folder of the capture, or another program's project
 --out RUN  folder for the results
@@ -102,33 +101,16 @@ FLAGS = """
     needs no GPU and no --out
 --sfm DIR  folder for the capture that is made of photographs without poses (default: RUN_capture)
 --no-sfm  refuse photographs without poses
+--viewer [PORT=8080]  show the training in the browser (default port: %(const)s); needs the extra view
+--viewer-host HOST  address to listen on (default: %(default)s, this machine only)
 """
 
 
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "train", run, summary, HELP, add_help=False)
-    _add_helps(parser)
-    add_flags(parser, FLAGS, {"--extend": _EXTENSION, "--minutes": float})
-    parser.add_argument(
-        "--viewer",
-        type=int,
-        nargs="?",
-        const=_PORT,
-        metavar="PORT",
-        help=f"show the training in the browser (default port: {_PORT}); needs the extra view",
-    )
-    add_flags(parser, "--viewer-host HOST  address to listen on (default: %(default)s, this machine only)")
-    parser.set_defaults(viewer_host="127.0.0.1")
-    add_device(parser, shares_gpus=True)
-    for field in (*flat(to_dict(Config())), *REMOVED):
-        parser.add_argument(
-            f"--{field}", dest="overrides", action="append", default=[], type=f"{field}={{}}".format,
-            help=argparse.SUPPRESS,
-        )  # fmt: skip
-
-
-def _add_helps(parser: argparse.ArgumentParser) -> None:
+    types: Types = {"--extend": _EXTENSION, "--minutes": float, "--viewer": int}
+    parser = add_command(commands, "train", run, summary, HELP, ARGUMENTS, types, add_help=False)
+    parser.set_defaults(device="auto", viewer_host="127.0.0.1")
     parser.add_argument(
         "-h",
         "--help",
@@ -144,6 +126,11 @@ def _add_helps(parser: argparse.ArgumentParser) -> None:
         action=_Help,
         help="explain all fields of the configuration, as text or as a page, and stop",
     )
+    for field in (*flat(to_dict(Config())), *REMOVED):
+        parser.add_argument(
+            f"--{field}", dest="overrides", action="append", default=[], type=f"{field}={{}}".format,
+            help=argparse.SUPPRESS,
+        )  # fmt: skip
 
 
 class _Help(argparse.Action):
@@ -309,8 +296,11 @@ _FIGURES: dict[str, tuple[str, int, float]] = {
 
 def _print_summary(summary: dict[str, object], folder: Path, reported: bool) -> None:
     console, table = Console(emoji=False), Table(show_header=False)
-    # Print the path verbatim: rich must not interpret brackets and colons in it.
-    console.print(printable(str(folder)), markup=False, highlight=False, soft_wrap=True)
+
+    def say(text: str) -> None:  # as it is: rich must not interpret brackets and colons in paths
+        console.out(printable(text), highlight=False)
+
+    say(str(folder))
     if summary.get("split") == "train":
         console.print("no view is held out: the figures are those of the training views", style="yellow")
     for name, value in summary.items():
@@ -328,13 +318,12 @@ def _print_summary(summary: dict[str, object], folder: Path, reported: bool) -> 
         f"train --out {name} --extend 1.5": "train half as long again",
     }
     width = max(map(len, commands))
-    for text in (
-        *([f"report: {folder / run_files.REPORT}"] if reported else []),
-        f"pictures: {folder / run_files.EVALUATION}",
-        "next:",
-        *(f"  blitzgs {command:{width}}   {what}" for command, what in commands.items()),
-    ):
-        console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
+    if reported:
+        say(f"report: {folder / run_files.REPORT}")
+    say(f"pictures: {folder / run_files.EVALUATION}")
+    say("next:")
+    for command, what in commands.items():
+        say(f"  blitzgs {command:{width}}   {what}")
 
 
 def live_page(state: TrainingState, port: int, host: str) -> Live | None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from blitzgs.cli.arguments import Commands, add_capture, add_command, add_device, add_flags, add_model
+from blitzgs.cli.arguments import DATA, DEVICE, MODEL, Commands, add_command
 from blitzgs.config.files import changed, load_config
 from blitzgs.distributed.group import Ranks, extend_memory_in_place, resolve_device
 from blitzgs.formats.streamed_sog import META
@@ -39,7 +39,7 @@ Needs the package viser: pip install "blitzgs[view]".
 """
 
 
-FLAGS = """
+ARGUMENTS = f"""{MODEL}{DATA}{DEVICE}
 --port PORT  port to listen on; 0: any (default: %(default)s)
 --host HOST  address to listen on (default: %(default)s, this machine only)
 --paths DIR  folder for camera paths and screenshots (default: RUN/paths, or the folder of the file)
@@ -48,12 +48,8 @@ FLAGS = """
 
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    parser = add_command(commands, "view", run, summary, HELP)
-    add_model(parser)
-    add_flags(parser, FLAGS, {"--port": int})
-    parser.set_defaults(port=8080, host="127.0.0.1")
-    add_capture(parser)
-    add_device(parser)
+    defaults: dict[str, Any] = {"device": "auto", "port": 8080, "host": "127.0.0.1"}
+    add_command(commands, "view", run, summary, HELP, ARGUMENTS, {"--port": int}, **defaults)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -121,9 +117,8 @@ def tiles_server(folder: Path, host: str, port: int) -> ThreadingHTTPServer:
         tileset = json.loads((folder / TILESET).read_text(encoding="utf-8"))
         complete = tileset["asset"]["generator"] == "BlitzGS" and "view" in tileset["extras"]
     except (ValueError, LookupError, TypeError, RecursionError) as error:
-        raise ValueError(
-            f"{folder / TILESET} is damaged ({error}): write it again with blitzgs export"
-        ) from error
+        remedy = "write it again with blitzgs export"
+        raise ValueError(f"{folder / TILESET} is damaged ({error}): {remedy}") from error
     if not complete or not (folder / PAGE).is_file():
         raise ValueError(
             f"{folder} has no page of blitzgs export --tiles: it is another program's, or has SPZ inside "

@@ -35,7 +35,6 @@ class Share:
     share: float
 
     def __repr__(self) -> str:
-        """Name both in messages."""
         return f"{self.share:g} times {self.field}"
 
 
@@ -102,7 +101,9 @@ def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -
             parsed = yaml.load(value, _Loader)
         except _UNREADABLE as error:
             raise ConfigError(f"{name}: cannot read the value '{value}': {error}") from error
-        _merge(values, _nest(name.split("."), parsed), name)
+        for part in reversed(name.split(".")):
+            parsed = {part: parsed}
+        _merge(values, parsed, name)
     config = from_dict(values)
     for problem in problems(config):
         raise ConfigError(problem)
@@ -184,21 +185,16 @@ def _read(path: Path, seen: set[Path]) -> dict[str, Any]:
     if not isinstance(base, str):
         raise ConfigError(f"{path}: base must be a file name or the name of a recipe, got {base!r}")
     # A file beside this one, or a recipe; a copy of a recipe's file names its base with ".yaml".
-    beside, problem = (
-        path.parent / base,
-        f"{path}: base: {base}: no such file in {path.parent} and no such recipe",
-    )
-    found = beside if beside.is_file() else _recipe(base.removesuffix(".yaml"), problem)
+    found = path.parent / base
+    if not found.is_file():
+        problem = f"{path}: base: {base}: no such file in {path.parent} and no such recipe"
+        found = _recipe(base.removesuffix(".yaml"), problem)
     merged = _read(found, seen | {path})
     _merge(merged, values, str(path))
     return merged
 
 
 _MAX_DEPTH = 20
-
-
-def _nest(names: list[str], value: Any) -> dict[str, Any]:
-    return {names[0]: value if len(names) == 1 else _nest(names[1:], value)}
 
 
 def _merge(target: dict[str, Any], changes: dict[str, Any], where: str, depth: int = 0) -> None:
@@ -218,9 +214,8 @@ def _merge(target: dict[str, Any], changes: dict[str, Any], where: str, depth: i
 def _build(kind: type, values: Any, where: str) -> Any:
     hints = typing.get_type_hints(kind)
     if not isinstance(values, dict):
-        raise ConfigError(
-            f"{where or 'configuration'}: must be a section with {', '.join(hints)}; got {values!r}"
-        )
+        name = where or "configuration"
+        raise ConfigError(f"{name}: must be a section with {', '.join(hints)}; got {values!r}")
     if where == "loss":
         values = _in_todays_unit(values)
     arguments = {}
@@ -289,9 +284,7 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
             options = options[:1] * len(value)
         if not isinstance(value, (list, tuple)) or len(value) != len(options):
             raise ConfigError(f"{path}: must be a list of {len(options)} values, got {value!r}")
-        return tuple(
-            _convert(o, v, f"{path}[{i}]") for i, (o, v) in enumerate(zip(options, value, strict=True))
-        )
+        return tuple(_convert(o, v, f"{path}[{i}]") for i, (o, v) in enumerate(zip(options, value)))  # noqa: B905
     if hint in (int, float) and isinstance(value, str):
         # YAML 1.1 reads 1e-4 as a string. An integer keeps all its digits, which a float may not hold.
         text = value

@@ -7,7 +7,6 @@ import dataclasses
 import difflib
 import inspect
 import itertools
-import math
 import re
 import textwrap
 import types
@@ -56,12 +55,9 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
 def problems(config: Config) -> Iterator[str]:
     """Name each field whose value makes no sense, with the value and what is allowed."""
     for name, value in flat(dataclasses.asdict(config)).items():
-        if (
-            name in RANGES
-            and value is not None
-            and not all(number in RANGES[name] for number in _numbers(value))
-        ):
-            yield f"{name}: must be {RANGES[name]}, got {value}"
+        allowed = RANGES.get(name)
+        if allowed and value is not None and not all(number in allowed for number in _numbers(value)):
+            yield f"{name}: must be {allowed}, got {value}"
     schedule, population = config.schedule, config.population
     yield from _problems_of_length(schedule)
     yield from _problems_of_resolution(schedule)
@@ -87,7 +83,6 @@ def problems(config: Config) -> Iterator[str]:
 
 
 def _numbers(value: Any) -> list[Any]:
-    """Return the values of nested tuples."""
     return [number for part in value for number in _numbers(part)] if isinstance(value, tuple) else [value]
 
 
@@ -100,11 +95,9 @@ def _problems_of_length(schedule: ScheduleConfig) -> Iterator[str]:
         yield f"schedule.pace: its factors must be {SCALE}, got {wrong[0]}"
     stretch = MAX_STRETCH if schedule.images_per_view > 0 else 1.0
     total = schedule.iterations * schedule.scale * stretch * max([1.0, *factors])
-    if not math.isnan(total) and total > MAX_IMAGES:
-        yield (
-            f"schedule.iterations: times schedule.scale must be at most {MAX_IMAGES:,} images, got "
-            f"{total:,.0f}"
-        )
+    if total > MAX_IMAGES:
+        most = f"must be at most {MAX_IMAGES:,} images, got {total:,.0f}"
+        yield f"schedule.iterations: times schedule.scale {most}"
     if schedule.minutes > 0 and schedule.scale != 1.0:
         yield (
             f"schedule.scale: must be 1 with schedule.minutes (--minutes), which chooses the scale; got "
@@ -178,12 +171,9 @@ def describe_page() -> str:
 
 def _first_clause(text: str) -> str:
     """Return a text up to the first semicolon or full stop outside of parentheses."""
-    depth = 0
-    for place, sign in enumerate(text):
-        depth += (sign == "(") - (sign == ")")
-        if depth == 0 and re.match(r";|\.(?= [A-Z0-9]|$)", text[place:]):
-            return text[:place]
-    return text
+    ends = re.finditer(r";|\.(?= [A-Z0-9]|$)", text)
+    clauses = (text[: end.start()] for end in ends)
+    return next((clause for clause in clauses if clause.count("(") == clause.count(")")), text)
 
 
 def _section(section: str) -> str:
@@ -193,7 +183,6 @@ def _section(section: str) -> str:
 
 
 def _about(section: str) -> str:
-    """Return what the docstring of a section says before its fields."""
     return (inspect.getdoc(_SECTIONS[section]) or "").partition("\nAttributes:")[0].strip()
 
 

@@ -25,9 +25,9 @@ class Pace:
     """
 
     def __init__(self, scale: float, changes: Sequence[tuple[int, float]]) -> None:
-        """Make a map of `scale` images of the run per image of the configuration.
+        """Make a map of `scale` images per image of the configuration, times a factor from an image on.
 
-        `changes`, (image of the run, factor) with increasing images above 0: from there, times the factor.
+        `changes`: (image of the run, factor) with increasing images above 0.
         """
         self._images = [0.0, *(float(image) for image, _ in changes)]
         self._scales = [scale, *(scale * factor for _, factor in changes)]
@@ -176,10 +176,8 @@ class Schedule:
         The position rate falls exponentially from `position` times `extent` to `POSITION_LEFT` of it over
         `position_decay` images. The opacity rate is constant; that of SH is `SH_SHARE` of `sh_dc`. The other
         rates fall exponentially from `densify_until` to `position_decay`, where `final` of them is left.
-        Every rate is multiplied by sqrt(B).
-
-        `config`: the rates for B = 1. `extent`: the scene's extent in its own unit. Returns float32
-        [S + 1, 6]: row s holds the rates of step s = 1..S for `RATES`; row 0 is zero.
+        Every rate, those of `config` for B = 1, is multiplied by sqrt(B). Returns float32 [S + 1, 6]: row s
+        holds the rates of step s = 1..S for `RATES`; row 0 is zero.
         """
         begin = torch.arange(self.steps, dtype=torch.float64) * self.batch_size
         times = self.pace.times(begin)

@@ -70,22 +70,17 @@ class Ranks:
     ) -> Ranks:
         """Join the job that torchrun's environment describes: Gloo on the CPU, NCCL on CUDA.
 
-        NCCL does not support two ranks on one GPU. If ranks share GPUs, Gloo is used for CUDA tensors too.
+        Without torchrun, or with a single process, `world_size` is 1.
 
         Args:
             device: "auto" (CUDA when this torch has a GPU), "cpu", "cuda" or "cuda:INDEX".
             timeout_seconds: see the class.
-            transport: how splats are sent between ranks: "peer" writes them to the other GPUs' memory,
-                "collective" sends them by NCCL or Gloo, "auto" uses "peer" if it works and "collective"
-                otherwise.
+            transport: how splats are sent between ranks, see `blitzgs.config.fields.RanksConfig`.
             share_gpus: if a host has fewer GPUs than ranks, let several ranks use one GPU, in turns; slow,
-                for development.
+                for development. NCCL does not support this, so Gloo is used for CUDA tensors too.
             tables_on_host: whether collectives will carry tensors that are on the CPU although the ranks
                 compute on CUDA.
             lap: called with the name of each part of this work at its end (`Laps.lap`).
-
-        Returns:
-            The ranks; without torchrun, or with a single process, an object with `world_size` 1.
 
         Raises:
             ValueError: the CUDA device does not exist, the transport is unknown, or `share_gpus` was set for
@@ -147,9 +142,8 @@ class Ranks:
         # The libraries' own timeouts name only a socket or an operation. The watchdog's timeout is shorter:
         # it names a rank, and it waits for ranks that are busy on their host.
         margin = 2.0 * Watchdog.period_for(self.timeout_seconds) + 10.0
-        dist.distributed_c10d._set_pg_timeout(
-            timedelta(seconds=max(self.timeout_seconds, BUSY_SECONDS) + margin), dist.group.WORLD
-        )
+        longest = timedelta(seconds=max(self.timeout_seconds, BUSY_SECONDS) + margin)
+        dist.distributed_c10d._set_pg_timeout(longest, dist.group.WORLD)
         lap("processes")
         self._choose_transport(transport, self.timeout_seconds + margin)
         lap("shared memory")
@@ -242,8 +236,7 @@ class Ranks:
         holder: list[Any] = [value]
         with self.watchdog.waiting("broadcast_object"):
             dist.broadcast_object_list(holder, device=self.device)
-        result: T = holder[0]
-        return result
+        return holder[0]
 
     def barrier(self) -> None:
         """Wait for all ranks."""
@@ -338,11 +331,9 @@ def resolve_device(
 
 
 def connect(ranks: Ranks, timeout_seconds: float) -> SharedMemory | str:
-    """Set up shared memory between all ranks, or return why that is impossible, the same on every rank.
+    """Set up shared memory between ranks that have joined, or return why that is impossible. Collective.
 
-    Collective.
-
-    `ranks`: the ranks, joined. `timeout_seconds`: longest wait in a barrier.
+    The answer is the same on every rank. `timeout_seconds`: longest wait in a barrier.
     """
     location = (socket.gethostname(), ranks.device.index if ranks.device.type == "cuda" else None)
     locations = ranks.all_gather_object(location)

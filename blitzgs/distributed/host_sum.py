@@ -137,5 +137,4 @@ class HostSum:
 
 @lru_cache(maxsize=16)
 def _side_of(device: torch.device) -> _Side | None:
-    """Return the second stream of a device; None on the CPU."""
     return _Side(torch.cuda.Stream(device), torch.cuda.Event()) if device.type == "cuda" else None

@@ -66,18 +66,11 @@ def smallest(keys: Tensor, ids: Tensor, k: int, ranks: Ranks) -> Tensor:
 def mass_prefix(scores: Tensor, ids: Tensor, fraction: float, ranks: Ranks) -> Tensor:
     """Mark the fewest rows, by descending score (ties by id), that hold a share of the total score.
 
-    Args:
-        scores: float32 [N_rank], finite, >= 0.
-        ids: int64 [N_rank], >= 0, unique over all ranks.
-        fraction: share of the total of all ranks, in [0, 1]; its decimal value counts (0.99 is 99/100).
-
-    Returns:
-        bool [N_rank]; the same ids at every world size. The sums are exact. If the total is zero, nothing is
-        marked.
-
-    Raises:
-        ValueError: on every rank, when a score of any rank is negative or not finite, or for a fraction
-            outside [0, 1].
+    `scores`: float32 [N_rank], finite, >= 0. `ids`: int64 [N_rank], >= 0, unique over all ranks. `fraction`:
+    share of the total of all ranks, in [0, 1]; its decimal value counts (0.99 is 99/100). Returns bool
+    [N_rank]; the same ids at every world size. The sums are exact. If the total is zero, nothing is marked.
+    ValueError: on every rank, when a score of any rank is negative or not finite, or for a fraction outside
+    [0, 1].
     """
     if not 0 <= fraction <= 1:
         raise ValueError(f"mass_prefix: fraction must be in [0, 1], got {fraction}")
@@ -109,26 +102,15 @@ def integer_mass_prefix(
     This is `mass_prefix` for integers, in several independent sets. With one rank the host does not wait for
     the device. Several ranks wait once, and exchange one histogram of all segments per round.
 
-    Args:
-        weights: int64 [P], not negative; a segment's sum over all ranks must be below 2^62.
-        segments: int32 [P] in [0, n_segments).
-        owners: int32 [P], the row that each weight belongs to.
-        ids: int64 [N], >= 0, ids of the rows; unique over all ranks within a segment.
-        fraction: share of the total of all ranks, in [0, 1]; its decimal value counts, of at most 9 places.
-        n_segments: number of segments.
-
-    Returns:
-        bool [P]; the same ids at every world size. The sums are exact. A segment whose total is zero selects
-        nothing.
-
-    Raises:
-        ValueError: for a fraction outside [0, 1] or with more places.
+    `weights`: int64 [P], not negative; a segment's sum over all ranks must be below 2^62. `segments`: int32
+    [P] in [0, n_segments). `owners`: int32 [P], the row that each weight belongs to. `ids`: int64 [N], of the
+    rows. The fraction has at most 9 decimal places. Returns bool [P], under the conditions of `mass_prefix`;
+    ids are unique within a segment.
     """
     share = decimal_share(fraction)
     if not 0 <= share <= 1 or share.denominator > 10**9:
-        raise ValueError(
-            f"integer_mass_prefix: fraction must be in [0, 1] with at most 9 decimals, got {fraction}"
-        )
+        allowed = "in [0, 1] with at most 9 decimals"
+        raise ValueError(f"integer_mass_prefix: fraction must be {allowed}, got {fraction}")
     cut = MassCut.begin(weights, segments, owners, ids, n_segments)
     ratio = share.numerator, share.denominator
     if ranks.world_size == 1:

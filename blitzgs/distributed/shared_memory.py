@@ -52,19 +52,12 @@ def control_words(world_size: int) -> int:
 
 
 class SharedMemory:
-    """The shared memory of the ranks; make it with `connect`.
-
-    Args:
-        rank: this rank.
-        world_size: M.
-        device: where this rank computes.
-        control: this rank's control words, symmetric memory, `control_words` zeros.
-        timeout_seconds: longest wait in a barrier.
-    """
+    """The shared memory of the ranks; make it with `connect`."""
 
     def __init__(
         self, rank: int, world_size: int, device: torch.device, control: Tensor, timeout_seconds: float
     ) -> None:
+        """Map this rank's control words, symmetric memory of `control_words` zeros, on all ranks."""
         self.rank, self.world_size, self.device = rank, world_size, device
         self.timeout_seconds = timeout_seconds
         self.buffers: list[Tensor] = []  # int32 [words] of each rank, mapped here

@@ -102,30 +102,22 @@ class NoWatchdog:
     """Takes the place of a `Watchdog` in a process that waits for no other process; it does nothing."""
 
     def waiting(self, name: str) -> AbstractContextManager[None]:
-        """See `Watchdog.waiting`."""
+        """See `Watchdog.waiting`, also for `working`."""
         return nullcontext()
 
-    def working(self, what: str) -> AbstractContextManager[None]:
-        """See `Watchdog.working`."""
-        return nullcontext()
+    working = waiting
 
-    def report_failure(self, message: str) -> None:
-        """See `Watchdog.report_failure`."""
+    def stop(self, message: str = "") -> None:
+        """See `Watchdog.stop`, and `Watchdog.report_failure`."""
 
-    def stop(self) -> None:
-        """See `Watchdog.stop`."""
+    report_failure = stop
 
 
 class Watchdog:
-    """Publishes the progress of one rank every few seconds, and compares it with that of the other ranks.
-
-    Args:
-        rank: this rank.
-        world_size: number of ranks.
-        timeout_seconds: longest wait inside one collective.
-    """
+    """Publishes the progress of one rank every few seconds, and compares it with that of the other ranks."""
 
     def __init__(self, rank: int, world_size: int, timeout_seconds: float) -> None:
+        """Begin to watch; `timeout_seconds`: longest wait inside one collective."""
         self.rank = rank
         self.world_size = world_size
         self.timeout_seconds = timeout_seconds
@@ -138,9 +130,8 @@ class Watchdog:
         self.name = "start"
         self.busy = ""
         self.waiting_since: float | None = None
-        self._heard: dict[
-            int, tuple[float, float]
-        ] = {}  # of each rank: its last stamp, and when it was new here
+        # Of each rank: its last stamp, and when it was new here.
+        self._heard: dict[int, tuple[float, float]] = {}
         self._announced = 0.0
         self._excused = 0.0  # when a late rank was last seen at work
         self.stopping = threading.Event()

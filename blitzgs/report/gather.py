@@ -58,11 +58,6 @@ class RunData:
         """The numbers of the summary."""
         return {name: value for name, value in self.summary.items() if isinstance(value, (int, float))}
 
-    @property
-    def is_test(self) -> bool:
-        """Whether the measured views are held out."""
-        return self.cameras is None or bool(self.cameras.test)
-
 
 def read_run(path: Path) -> RunData:
     """Read a run (FileNotFoundError: it is none); damaged files are left out, and named in `problems`."""
@@ -81,11 +76,8 @@ def read_run(path: Path) -> RunData:
         data.frame = load_world_frame(path)
     except ValueError as error:
         data.problems.append(f"{error}.")
-    evaluations = path / run_files.EVALUATION
-    found = [
-        file for file in evaluations.glob("*/metrics.json") if re.fullmatch(r"\d+|test", file.parent.name)
-    ]
-    if found:
+    files = (path / run_files.EVALUATION).glob("*/metrics.json")
+    if found := [file for file in files if re.fullmatch(r"\d+|test", file.parent.name)]:
         newest = max(found, key=lambda file: file.stat().st_mtime)
         data.measured, data.views = newest.parent, _views_of(newest, data.problems)
     return data
@@ -108,11 +100,8 @@ def curves(data: RunData) -> dict[str, list[Point]]:
             kinds = _POPULATION_EVENTS if name == "gaussians" else (None,)
             if kind in kinds and _is_number(record.get(name)):
                 found[name].append((t, seconds, float(record[name])))
-        if (
-            kind in ("glance", "evaluation")
-            and record.get("split") != "train"
-            and _is_number(record.get("psnr"))
-        ):
+        is_held_out = kind in ("glance", "evaluation") and record.get("split") != "train"
+        if is_held_out and _is_number(record.get("psnr")):
             found["held_out"].append((t, seconds, float(record["psnr"])))
     return {name: _thinned(points) for name, points in found.items()}
 
@@ -120,15 +109,11 @@ def curves(data: RunData) -> dict[str, list[Point]]:
 def _thinned(points: list[Point]) -> list[Point]:
     """Return means over stretches of a curve, with five digits."""
     size = max(1, math.ceil(len(points) / MAX_POINTS))
-    parts = [points[k : k + size] for k in range(0, len(points), size)]
-    return [
-        (
-            part[-1][0],
-            None if part[-1][1] is None else round(part[-1][1], 1),
-            digits(fmean(p[2] for p in part)),
-        )
-        for part in parts
-    ]
+    found: list[Point] = []
+    for part in (points[k : k + size] for k in range(0, len(points), size)):
+        t, seconds, _ = part[-1]
+        found.append((t, None if seconds is None else round(seconds, 1), digits(fmean(p[2] for p in part))))
+    return found
 
 
 def warnings_of(data: RunData) -> list[tuple[float, str, str]]:
@@ -181,11 +166,8 @@ def plan(data: RunData) -> dict[str, Any] | None:
     points = []
     for index in sorted({*train, *held}):
         name = cameras.cameras[index].name
-        psnr = known.get(name)
-        place = [round(float(value), decimals) for value in flat[index]]
-        points.append(
-            (*place, int(index in held), None if psnr is None else round(psnr, 2), short_name(name))
-        )
+        psnr = round(known[name], 2) if name in known else None
+        points.append((*flat[index].round(decimals).tolist(), int(index in held), psnr, short_name(name)))
     measured = bool(train) and all(cameras.cameras[index].name in known for index in train)
     return {"points": points, "trained_known": measured, "unit": "m" if metres else "unit"}
 

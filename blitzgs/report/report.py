@@ -34,13 +34,12 @@ MAX_BYTES = 10_000_000
 _ROOM_FOR_NOTES = 1000
 
 
-def page(
-    title: str, scripts: tuple[str, ...], data: Mapping[str, Any], look: Mapping[str, str] | None = None
-) -> str:
-    """Return a page of some scripts of `assets` and their data; numbers that JSON lacks become null.
+# "html", a page with the model in 3D, and "note", a sentence about it; None: there is none.
+Look = Mapping[str, str] | None
 
-    `look` has "html", a page with the model in 3D, and "note", a sentence about it; None: there is none.
-    """
+
+def page(title: str, scripts: tuple[str, ...], data: Mapping[str, Any], look: Look = None) -> str:
+    """Return a page of some scripts of `assets` and their data; numbers that JSON lacks become null."""
     assets = files("blitzgs.report") / "assets"
     values = {
         "@TITLE@": as_html(title),
@@ -53,9 +52,7 @@ def page(
     return "".join(values.get(part, part) for part in parts)
 
 
-def fitted(
-    title: str, scripts: tuple[str, ...], data: dict[str, Any], look: Mapping[str, str] | None = None
-) -> str:
+def fitted(title: str, scripts: tuple[str, ...], data: dict[str, Any], look: Look = None) -> str:
     """Return a page of at most `MAX_BYTES`: the look in 3D is left out first, then pictures; it says so."""
     pictures, notes = data["pictures"], list(data["left_out"])
     room = MAX_BYTES - _ROOM_FOR_NOTES - len(page(title, scripts, data | {"pictures": []}).encode())
@@ -96,15 +93,15 @@ _SCRIPTS = ("parts.js", "report.js")
 _SHOWN_EXTREMES = 4
 
 
-def report(folder: Path, look: Mapping[str, str] | None = None) -> str:
-    """Return the report of a run, which may be unfinished, as HTML of at most `MAX_BYTES`; see `page`."""
+def report(folder: Path, look: Look = None) -> str:
+    """Return the report of a run, which may be unfinished, as HTML of at most `MAX_BYTES`."""
     data = read_run(folder)
     metrics = gather.metrics_of(data.views)
     content = {
         "name": folder.resolve().name,
         "subtitle": gather.subtitle(data),
         "summary": data.figures,
-        "split": "test" if data.is_test else "train",
+        "split": "test" if data.cameras is None or data.cameras.test else "train",
         "metrics": metrics,
         "views": list(gather.rows_of(data.views, metrics)),
         "pictures": _pictures(data),
@@ -120,7 +117,7 @@ def report(folder: Path, look: Mapping[str, str] | None = None) -> str:
     return fitted(f"{content['name']} · report", _SCRIPTS, content, look)
 
 
-def write_report(folder: Path, look: Mapping[str, str] | None = None, out: Path | None = None) -> Path:
+def write_report(folder: Path, look: Look = None, out: Path | None = None) -> Path:
     """Write the report of a run, into its folder if `out` is None; return the file."""
     path = out or folder / run_files.REPORT
     write_page(path, report(folder, look))
@@ -137,11 +134,10 @@ def _pictures(data: RunData) -> list[dict[str, Any]]:
     found = []
     for label, names in (("worst", worst), ("best", best), ("", others)):
         for name in names:
-            layers = gather.layers(data, indices[name]) if name in indices else None
-            if layers is None:
+            if name not in indices or (layers := gather.layers(data, indices[name])) is None:
                 continue
             psnr = data.views[name].get("psnr")
-            note = " ".join(part for part in (label, "" if psnr is None else f"{psnr:.2f} dB") if part)
+            note = " ".join(filter(None, (label, "" if psnr is None else f"{psnr:.2f} dB")))
             shown = [{"label": part, "src": layers[part]} for part in ("photograph", "render", "error")]
             found.append({"name": gather.short_name(name), "note": note, "layers": shown})
     return found

@@ -33,13 +33,8 @@ _PIECE, _NAMED, _THREADS = 4096, 4, 16
 class RunCamera:
     """A pinhole camera with the fields of `blitzgs.capture.cameras.Camera` that rendering reads.
 
-    Attributes:
-        name: name of the image.
-        width: image width in pixels.
-        height: image height in pixels.
-        K: intrinsics in pixels, float64 [3, 3]; pixel (i, j) has its centre at (i + 0.5, j + 0.5).
-        world_to_camera: rigid pose, float64 [4, 4], in the re-centred world (capture position - the run's
-            offset).
+    Sizes are in pixels, and so is K, float64 [3, 3]: pixel (i, j) has its centre at (i + 0.5, j + 0.5). The
+    pose, float64 [4, 4], is rigid, in the re-centred world (capture position - the run's offset).
     """
 
     name: str
@@ -51,24 +46,16 @@ class RunCamera:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RunCameras:
-    """All cameras of a run.
+    """All cameras of a run."""
 
-    Attributes:
-        cameras: all cameras in the order of the capture.
-        train: indices of the training cameras.
-        test: indices of the held-out cameras.
-        inputs: paths of the photographs and masks during training.
-    """
-
-    cameras: Sequence[CameraLike]
-    train: list[int]
-    test: list[int]
-    inputs: list[Path]
+    cameras: Sequence[CameraLike]  # in the order of the capture
+    train: list[int]  # indices of the training cameras
+    test: list[int]  # indices of the held-out cameras
+    inputs: list[Path]  # paths of the photographs and masks during training
 
     def __repr__(self) -> str:
-        return (
-            f"RunCameras({len(self.cameras):,} cameras: {len(self.train):,} train, {len(self.test):,} test)"
-        )
+        parts = f"{len(self.train):,} train, {len(self.test):,} test"
+        return f"RunCameras({len(self.cameras):,} cameras: {parts})"
 
 
 def checked_camera(
@@ -122,9 +109,8 @@ def _matrix(argument: str, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
     try:
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise TypeError(
-            f"{argument} must be a matrix of numbers, got {type(value).__name__} ({error})"
-        ) from error
+        kind = type(value).__name__
+        raise TypeError(f"{argument} must be a matrix of numbers, got {kind} ({error})") from error
 
 
 def save_cameras(folder: Path, capture: Capture, run_id: str = "") -> None:
@@ -216,7 +202,9 @@ def load_cameras(folder: Path) -> RunCameras:
             RunCamera(str(view["name"]), int(width), int(height), K, pose)
             for view, (width, height), K, pose in zip(views, sizes, Ks, poses, strict=True)
         ]
-        train, test = _indices(content["train"], len(cameras)), _indices(content["test"], len(cameras))
+        train, test = ([int(index) for index in content[part]] for part in ("train", "test"))
+        if any(not 0 <= index < len(cameras) for index in (*train, *test)):
+            raise ValueError("a view of the split does not exist")
         return RunCameras(cameras, train, test, [Path(text) for text in content["inputs"]])
     except FileNotFoundError:
         raise
@@ -233,13 +221,6 @@ def input_files(capture: Capture) -> list[Path]:
     """Return the paths of a capture's photographs and masks, which no command may overwrite."""
     images = [camera.image_path for camera in capture.cameras]
     return images + [camera.mask_path for camera in capture.cameras if camera.mask_path is not None]
-
-
-def _indices(values: Sequence[int], count: int) -> list[int]:
-    indices = [int(value) for value in values]
-    if any(not 0 <= index < count for index in indices):
-        raise ValueError("a view of the split does not exist")
-    return indices
 
 
 # Photographs whose gains differ by less than this, as a standard deviation, have the same exposure.

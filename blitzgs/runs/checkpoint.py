@@ -106,7 +106,6 @@ class Saving:
         device: torch.device,
         ready: torch.cuda.Event | None,
     ) -> tuple[Shard, Shard | None]:
-        """Write this rank's files, and return them."""
         self._folder.mkdir(parents=True, exist_ok=True)
         file = f"shard_{self._ranks.rank:04d}_of_{self._ranks.world_size:04d}.safetensors"
         # On a stream of its own, copies to the host wait for no later work.

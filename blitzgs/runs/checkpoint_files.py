@@ -25,7 +25,7 @@ from safetensors import safe_open
 from torch import Tensor
 
 from blitzgs.util.errors import amount
-from blitzgs.util.output import sync_to_disk
+from blitzgs.util.output import sync_to_disk, write_file
 
 FORMAT = 2
 MANIFEST = "manifest.json"
@@ -56,7 +56,13 @@ def verified(path: Path, part: int = 0, parts: int = 1) -> Manifest:
     """Read the manifest of a checkpoint, and compare part of the files with their digests; see `DAMAGE`."""
     manifest = read_manifest(path)
     for shard in [*manifest.shards, *([manifest.shared] if manifest.shared else [])][part::parts]:
-        _verify(path, shard)
+        file = path / shard.file
+        if not file.exists():
+            raise ValueError(f"{shard.file} is missing")
+        if (size := file.stat().st_size) != shard.bytes:
+            raise ValueError(f"{shard.file} has {size} bytes, the manifest says {shard.bytes}")
+        if file_digest(file) != shard.sha256:
+            raise ValueError(f"{shard.file} does not match its SHA-256")
     return manifest
 
 
@@ -84,16 +90,6 @@ def _digest(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def _verify(path: Path, shard: Shard) -> None:
-    file = path / shard.file
-    if not file.exists():
-        raise ValueError(f"{shard.file} is missing")
-    if file.stat().st_size != shard.bytes:
-        raise ValueError(f"{shard.file} has {file.stat().st_size} bytes, the manifest says {shard.bytes}")
-    if file_digest(file) != shard.sha256:
-        raise ValueError(f"{shard.file} does not match its SHA-256")
-
-
 def finish(unfinished: Path, path: Path, manifest: Manifest) -> None:
     """Write the manifest beside the shards and give the folder its final name, each step synced."""
     missing = [shard.file for shard in manifest.shards if not (unfinished / shard.file).exists()]
@@ -101,27 +97,16 @@ def finish(unfinished: Path, path: Path, manifest: Manifest) -> None:
         raise OSError(f"{', '.join(missing)} not in {unfinished}: every rank must see the same file system")
     content = {"format": FORMAT, "world_size": len(manifest.shards)} | asdict(manifest)
     content = json.loads(json.dumps(content))  # tuples become lists: what is read back has the same digest
-    with open(unfinished / MANIFEST, "w") as file:
-        json.dump(content | {"sha256": _digest(content)}, file, indent=1)
-        file.flush()
-        os.fsync(file.fileno())
-    sync_to_disk(unfinished)
+    write_file(unfinished / MANIFEST, json.dumps(content | {"sha256": _digest(content)}, indent=1))
     unfinished.rename(path)
     sync_to_disk(path.parent)
 
 
 _DTYPES = {
-    torch.float64: "F64",
-    torch.float32: "F32",
-    torch.float16: "F16",
-    torch.bfloat16: "BF16",
-    torch.int64: "I64",
-    torch.int32: "I32",
-    torch.int16: "I16",
-    torch.int8: "I8",
-    torch.uint8: "U8",
+    torch.float64: "F64", torch.float32: "F32", torch.float16: "F16", torch.bfloat16: "BF16",
+    torch.int64: "I64", torch.int32: "I32", torch.int16: "I16", torch.int8: "I8", torch.uint8: "U8",
     torch.bool: "BOOL",
-}
+}  # fmt: skip
 _CHUNK_BYTES = 64 << 20
 
 
@@ -134,16 +119,10 @@ def write_shard(path: Path, columns: Mapping[str, Tensor]) -> tuple[int, str]:
     names = sorted(columns, key=lambda name: (-columns[name].element_size(), name))
     header, offset = {}, 0
     for name in names:
-        column = columns[name]
-        end = offset + column.numel() * column.element_size()
-        header[name] = {
-            "dtype": _DTYPES[column.dtype],
-            "shape": list(column.shape),
-            "data_offsets": [offset, end],
-        }
-        offset = end
-    free = shutil.disk_usage(path.parent).free
-    if free < offset:
+        column, begin, offset = columns[name], offset, offset + columns[name].nbytes
+        shape = {"dtype": _DTYPES[column.dtype], "shape": list(column.shape)}
+        header[name] = shape | {"data_offsets": [begin, offset]}
+    if (free := shutil.disk_usage(path.parent).free) < offset:
         text = f"{amount(offset)} are needed and {amount(free)} are free"
         raise OSError(errno.ENOSPC, text, str(path.parent))
     head = json.dumps(header).encode()

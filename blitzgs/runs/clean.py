@@ -7,6 +7,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
+from statistics import fmean
 
 import numpy as np
 import numpy.typing as npt
@@ -97,11 +98,8 @@ def _rows(model: Model, rows: Tensor) -> Model:
 
 
 def _psnr(model: Model, cameras: RunCameras, photograph: Callable[[int], npt.NDArray[np.uint8]]) -> float:
-    found = []
-    for index in cameras.test:
-        target = torch.from_numpy(photograph(index))
-        found.append(image_metrics(model.render(cameras.cameras[index]).cpu(), target, None)["psnr"])
-    return sum(found) / len(found)
+    views = ((model.render(cameras.cameras[i]).cpu(), torch.from_numpy(photograph(i))) for i in cameras.test)
+    return fmean(image_metrics(render, target, None)["psnr"] for render, target in views)
 
 
 def _small(camera: CameraLike) -> RunCamera:
@@ -129,21 +127,15 @@ def views_counting(cull: Tensor, n_views: int) -> Tensor:
 def floaters(means: Tensor, scales: Tensor, counted: Tensor, most_views: int) -> Tensor:
     """Tell which Gaussians to remove, bool [N]: few views count them, and they are far or large.
 
-    Small ones among Gaussians that more views count stay: they are details.
-
-    Args:
-        means: float32 [N, 3].
-        scales: logarithms, float32 [N, 3], in the same unit.
-        counted: number of training views that count each Gaussian, int [N].
-        most_views: Gaussians that more views count stay.
+    Small ones among Gaussians that more than `most_views` count stay: they are details. Means and logarithms
+    of scales are float32 [N, 3], in the same unit; `counted`: how many training views count each, int [N].
     """
     weak = counted <= most_views
     sound = ~weak
     if int(sound.sum()) <= _NEIGHBOURS or not bool(weak.any()):
         return torch.zeros_like(weak)
     sizes = scales.amax(dim=1)
-    remove = torch.zeros_like(weak)
-    remove[weak] = sizes[weak] > _share(sizes[sound], _LARGE)
+    remove = weak & (sizes > _share(sizes[sound], _LARGE))
     remove[weak] |= _far(means[weak], means[sound])
     return remove
 

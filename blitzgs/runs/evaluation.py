@@ -17,7 +17,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -90,15 +89,10 @@ def load_lpips(path: str | None) -> Lpips | None:
 
     ValueError: the file is missing or not a TorchScript module.
     """
-    if path is None:
-        return None
     try:
-        metric: Lpips = torch.jit.load(path, map_location="cpu")
+        return None if path is None else torch.jit.load(path, map_location="cpu")
     except (RuntimeError, ValueError) as error:
-        raise ValueError(
-            f"{path} is not a readable TorchScript module of LPIPS (--lpips): {error}"
-        ) from error
-    return metric
+        raise ValueError(f"{path} is not readable TorchScript of LPIPS (--lpips): {error}") from error
 
 
 def render_view(
@@ -150,36 +144,38 @@ def evaluate(
         folder: folder for `metrics.json` and the pictures; None: nothing is written.
         pictures: number of evenly spaced views for which render | photograph | error are written side by
             side; if not 0, the previews of the report are written too.
-        report: called with (views rendered, number of views) after each view.
-        optional_files: if a file cannot be written, warn instead of raising an error; used during training.
-        stops: asked after each round in which every rank compares one view; if it returns True, the
-            evaluation ends. It must return the same on every rank. None: never stop.
+        optional_files: if a file cannot be written, warn instead of raising an OSError.
+        stops: asked after each round in which every rank compares one view, with the same answer on every
+            rank; True ends the evaluation (EvaluationStoppedError).
 
-    Returns:
-        {"psnr": mean, "ssim": mean, "psnr_corrected": mean, ("lpips": mean,) "views": {name: {...}}}, the
-        same on every rank. Views whose pixels are all masked are left out; the means are absent if no view
-        remains.
-
-    Raises:
-        OSError: a file cannot be written, and `optional_files` is not set.
-        PhotographError: a photograph cannot be read; raised on every rank after the other views are measured.
-        EvaluationStoppedError: `stops` returned True.
+    Returns {"psnr": mean, "ssim": mean, "psnr_corrected": mean, ("lpips": mean,) "views": {name: {...}}}, the
+    same on every rank. Views whose pixels are all masked are left out; the means are absent if no view
+    remains. PhotographError: a photograph cannot be read; raised on every rank after the others are measured.
     """
     ranks = owners.ranks
     output = None if folder is None else OutputFolder(folder, inputs)
     chosen: dict[int, Path] = {}  # evenly spaced views, and the paths of their pictures
-    if output is not None:
-        count = min(pictures, len(indices))
-        spaced = [indices[k * len(indices) // count] for k in range(count)]
-        with _tolerated(optional_files):
-            paths = output.paths([cameras[index].name for index in spaced], ".jpg", flat=True)
-            chosen = dict(zip(spaced, paths, strict=True))
+
+    @contextmanager
+    def tolerated() -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            if not optional_files:
+                raise
+            warn(f"the evaluation could not write a file and goes on without it: {error}")
 
     def write(path: Path, content: bytes) -> None:
-        with _tolerated(optional_files):
+        with tolerated():
             if output is not None:
                 output.write(path, content)
 
+    if output is not None:
+        count = min(pictures, len(indices))
+        spaced = [indices[k * len(indices) // count] for k in range(count)]
+        with tolerated():
+            paths = output.paths([cameras[index].name for index in spaced], ".jpg", flat=True)
+            chosen = dict(zip(spaced, paths, strict=True))
     per_view: dict[str, dict[str, float]] = {}
     lost: str | None = None
     previews = Previews(folder, set(chosen)) if folder is not None and pictures > 0 else None
@@ -213,23 +209,11 @@ def evaluate(
     if folder is not None and ranks.rank == 0:
         write(folder / "metrics.json", json.dumps(result, indent=1).encode())
     if previews is not None:
-        psnr = {
-            i: result["views"][cameras[i].name]["psnr"] for i in indices if cameras[i].name in result["views"]
-        }
+        measured = result["views"]
+        psnr = {i: measured[cameras[i].name]["psnr"] for i in indices if cameras[i].name in measured}
         for path, content in previews.files(psnr, ranks.rank == 0):
             write(path, content)
     return result
-
-
-@contextmanager
-def _tolerated(optional: bool) -> Iterator[None]:
-    """Make a warning of an error of writing inside the context, if the file is optional."""
-    try:
-        yield
-    except OSError as error:
-        if not optional:
-            raise
-        warn(f"the evaluation could not write a file and goes on without it: {error}")
 
 
 def _over_all_ranks(
@@ -246,16 +230,10 @@ def _over_all_ranks(
     masked = [name for name in names if name not in found]
     if masked and ranks.rank == 0:
         shown = ", ".join(masked[:5]) + (", ..." if len(masked) > 5 else "")
-        text = f"{len(masked)} of {len(names)} views cannot be measured, as they are masked: {shown}"
-        warn(text)
+        warn(f"{len(masked)} of {len(names)} views cannot be measured, as they are masked: {shown}")
     views = {name: found[name] for name in names if name in found}
-    result: dict[str, Any] = {}
-    for metric in METRICS:
-        values = [view[metric] for view in views.values() if metric in view]
-        if values:
-            result[metric] = sum(values) / len(values)
-    result["views"] = views
-    return result
+    values = {metric: [view[metric] for view in views.values() if metric in view] for metric in METRICS}
+    return {metric: sum(some) / len(some) for metric, some in values.items() if some} | {"views": views}
 
 
 def worst_views(views: Mapping[str, Mapping[str, float]]) -> list[tuple[str, float]]:
@@ -292,10 +270,8 @@ class Previews:
         self._psnr[index] = psnr
         needed = _extremes(self._psnr) | self._fixed
         if index in needed:
-            pictures = (to_uint8(render), to_uint8(target), to_uint8(error_map(render, target, mask)))
-            self._kept[index] = {
-                part: _encoded(picture) for part, picture in zip(PARTS, pictures, strict=True)
-            }
+            pictures = map(_encoded, (render, target, error_map(render, target, mask)))
+            self._kept[index] = dict(zip(PARTS, pictures, strict=True))
         for other in self._kept.keys() - needed:
             del self._kept[other]
 
@@ -319,11 +295,11 @@ def _extremes(psnr: Mapping[int, float]) -> set[int]:
     return {*ordered[:_EXTREMES], *ordered[-_EXTREMES:]}
 
 
-def _encoded(picture: npt.NDArray[np.uint8]) -> bytes:
+def _encoded(image: Tensor) -> bytes:
+    picture = to_uint8(image)
     height, width = picture.shape[:2]
-    scale = min(1.0, _SIDE / max(height, width))
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    if scale < 1:
+    if (scale := _SIDE / max(height, width)) < 1:
+        size = max(1, round(width * scale)), max(1, round(height * scale))
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
     _, data = cv2.imencode(".webp", picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
     return bytes(data)

@@ -60,17 +60,12 @@ def export(
     metre, so a model there is written around its own origin, with the offset as a comment in the header and
     in a file beside it.
 
-    Args:
-        source: the Gaussians, in the capture's unit around the model's origin.
-        coordinates: "capture" writes the capture's coordinates, "centred" the re-centred ones; "auto" writes
-            the capture's if the format resolves them finely enough.
-        crs: reference system of world coordinates, for the file of the offset; empty: unknown. None: the
-            coordinates are the capture's.
-
-    Raises:
-        ValueError: there is a value that cannot be shown.
-        FileExistsError: the file or that of the offset is needed, and another program has one of its name.
-        OSError: the file cannot be written, or is no regular file.
+    The source is in the capture's unit around the model's origin. `coordinates`: "capture" writes the
+    capture's, "centred" the re-centred ones; "auto" the capture's if the format resolves them finely enough.
+    `crs`: reference system of world coordinates, for the file of the offset; empty: unknown. None: the
+    coordinates are the capture's. ValueError: there is a value that cannot be shown. FileExistsError: the
+    file or that of the offset is needed, and another program has one of its name. OSError: the file cannot be
+    written, or is no regular file.
     """
     check_replaces(path, kind)
     offset = np.array(space.offset)

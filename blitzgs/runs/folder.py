@@ -12,7 +12,7 @@ import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from blitzgs.runs.log import records
 from blitzgs.runs.trained_model import TrainedModel
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.view.gate import ModelGate, centres_of
-from blitzgs.view.views import CameraLike, Space, render_options, viewmat
+from blitzgs.view.views import CameraLike, Space, ViewSet, render_options, viewmat
 from blitzgs.view.visible import Subject
 
 
@@ -99,9 +99,8 @@ class Model:
             NotEnoughMemoryError: the image does not fit into memory.
         """
         camera = self._camera(camera)
-        images, alphas, _ = self._kept(camera).splat(
-            [camera], antialiased=self.config.model.antialiased, render_mode=render_mode
-        )
+        kept, antialiased = self._kept(camera), self.config.model.antialiased
+        images, alphas, _ = kept.splat([camera], antialiased, render_mode)
         if "D" in render_mode:
             images[..., -1] *= self.space.unit
         return torch.cat([images[0], alphas[0]], dim=-1) if alpha else images[0]
@@ -140,24 +139,22 @@ class Model:
     ) -> tuple[Tensor, Tensor, dict[str, Any]]:
         """Call `blitzgs.rasterization` for cameras of one size; return its images, alphas and meta."""
         options = render_options(self.config, self.space, self.sh_degree)
-        device = self.means.device
-        poses = np.stack([viewmat(camera, self.space) for camera in cameras])
-        background = torch.tensor([options.background] * len(cameras), device=device)
+        views = ViewSet(cameras, self.space, self.means.device).pick(list(range(len(cameras))))
         return rasterization(
             self.means,
             self.quats,
             self.scales.exp(),
             self.opacities.sigmoid(),
             self.sh,
-            torch.from_numpy(poses).float().to(device),
-            torch.from_numpy(np.stack([camera.K for camera in cameras])).float().to(device),
-            cameras[0].width,
-            cameras[0].height,
+            views.viewmats,
+            views.Ks,
+            views.width,
+            views.height,
             near_plane=options.near_plane,
             far_plane=options.far_plane,
             eps2d=options.eps2d,
             sh_degree=self.sh_degree,
-            backgrounds=background,
+            backgrounds=torch.tensor([options.background] * len(cameras), device=self.means.device),
             render_mode=render_mode,
             rasterize_mode="antialiased" if antialiased else "classic",
         )
@@ -238,12 +235,11 @@ class RunFolder:
     @staticmethod
     def _json(path: Path) -> dict[str, Any]:
         try:
-            content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            return cast(dict[str, Any], json.loads(path.read_text(encoding="utf-8")))
         except FileNotFoundError:
             return {}
         except ValueError as error:
             raise ValueError(f"{path} is damaged: {error}") from error
-        return content
 
 
 def subject_of(model: Model) -> Subject:

@@ -40,11 +40,11 @@ class LossGuard:
         one is not finite.
         """
         if frame.renders.device.type != "cuda":
-            _check_loss(step, names, sums, lambda: _origin(table, frame, names))
+            _check_loss(step, names, sums, lambda: _origin(step, None, table, frame, names))
             return
         previous, self._pending = self._pending, (step, names, sums)
         if previous is not None:
-            _check_loss(*previous, lambda: _later_origin(previous[0], step, table, frame, names))
+            _check_loss(*previous, lambda: _origin(previous[0], step, table, frame, names))
 
 
 def _check_loss(step: int, names: Sequence[str], sums: HostSum, origin: Callable[[], str]) -> None:
@@ -58,15 +58,12 @@ def _check_loss(step: int, names: Sequence[str], sums: HostSum, origin: Callable
         raise NonFiniteError(f"step {step}: the loss of view {views} is not finite; {origin()}")
 
 
-def _origin(table: GaussianTable, frame: Frame, names: Sequence[str]) -> str:
-    """Describe where the first non-finite value is, searching from the parameters to the image."""
+def _origin(step: int, later: int | None, table: GaussianTable, frame: Frame, names: Sequence[str]) -> str:
+    """Describe where the first non-finite value is, by the table and the frame of the step or a later one."""
     found = _first_in(table, frame, names)
-    return found or "parameters, projected Gaussians and images are finite: it comes from op photometric"
-
-
-def _later_origin(step: int, later: int, table: GaussianTable, frame: Frame, names: Sequence[str]) -> str:
-    """Describe the origin from the table and the frame of a later step, `later`."""
-    if (found := _first_in(table, frame, names)) is not None:
+    if later is None:
+        return found or "parameters, projected Gaussians and images are finite: it comes from op photometric"
+    if found is not None:
         return f"found in step {later}: {found}"
     views = ", ".join(f"'{name}'" for name in names)
     return (
@@ -123,9 +120,8 @@ def bad_column(table: GaussianTable, names: Iterable[str] = PARAMETERS) -> str |
 def check_table(table: GaussianTable, step: int, names: Iterable[str] = PARAMETERS) -> None:
     """Check parameters of this rank's Gaussians (NonFiniteError: names step, column and Gaussians)."""
     if (culprit := bad_column(table, names)) is not None:
-        raise NonFiniteError(
-            f"step {step}: {culprit}. Lower the learning rates (optimiser.*) or resume from a checkpoint"
-        )
+        remedy = "Lower the learning rates (optimiser.*) or resume from a checkpoint"
+        raise NonFiniteError(f"step {step}: {culprit}. {remedy}")
 
 
 def check_before_saving(table: GaussianTable, step: int, ranks: Ranks) -> None:

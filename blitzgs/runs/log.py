@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from datetime import timedelta
 from importlib.util import find_spec
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from rich.console import Console
@@ -29,15 +30,11 @@ from blitzgs.util.progress import Report, lines
 BOARD = "tensorboard"
 # Largest number of records that are kept while the disk is full; then the oldest are dropped.
 _MAX_WAITING = 10_000
-
 # Least seconds between two moves of a terminal's bar.
 _BAR_SECONDS = 0.5
-
 # The loss and the PSNR that are shown are means over this number of records; the file has each record's own.
-_MEAN_RECORDS = 20
-# The remaining time follows from the speed over so many records, which resolution and population change.
-_RATE_RECORDS = 20
-
+# The remaining time follows from the speed over as many, which resolution and population change.
+_RECENT = 20
 # Events after the last image, which a run that is resumed there logs again.
 _AT_THE_END = ("population", "image_memory", "evaluation", "worst views")
 
@@ -80,7 +77,7 @@ class RunLog:
         self._recent: dict[str, deque[float]] = {}
         self._held_out: float | None = None
         self._run_id = run_id
-        self._marks = deque([(done, time.monotonic())], maxlen=_RATE_RECORDS)
+        self._marks = deque([(done, time.monotonic())], maxlen=_RECENT)
         self.total = total  # images of the whole run, from which the remaining time is estimated
         self.console = Console(quiet=folder is None, highlight=False)
         if folder is None:
@@ -146,9 +143,9 @@ class RunLog:
         shown = dict(values)
         for name in ("loss", "psnr"):
             if name in values:
-                recent = self._recent.setdefault(name, deque(maxlen=_MEAN_RECORDS))
+                recent = self._recent.setdefault(name, deque(maxlen=_RECENT))
                 recent.append(values[name])
-                shown[name] = sum(recent) / len(recent)
+                shown[name] = fmean(recent)
         if self._held_out is not None:
             shown["held_out"] = self._held_out
         return "  ".join(show(shown[name]) for name, show in _SHOWN.items() if name in shown)
@@ -198,7 +195,6 @@ class RunLog:
                 self._waiting.popleft()
 
     def _draw(self, t: int, values: Mapping[str, float]) -> None:
-        """Add numbers to TensorBoard's events."""
         # Where the log file has no space, each writer's thread would end with a traceback on the terminal.
         if self._board is None or self._waiting:
             return

@@ -122,6 +122,5 @@ def _is_free(name: str) -> bool:
 
 
 def _differences(saved: Config, found: Config) -> list[tuple[str, Any, Any]]:
-    """Return the name and both values of the fields that differ."""
     old, new = flat(to_dict(saved)), flat(to_dict(found))
     return [(name, old[name], new[name]) for name in old if old[name] != new[name]]

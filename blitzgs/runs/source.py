@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -144,9 +145,8 @@ def open_source(folder: Path, only: str | None = None) -> RunSource:
     """
     check_is_run(folder)
     alone = Ranks()
-    found = checkpoint.newest(
-        folder / CHECKPOINTS, alone, lambda path: checkpoint.sound_manifest(path, alone), only
-    )
+    read = partial(checkpoint.sound_manifest, ranks=alone)
+    found = checkpoint.newest(folder / CHECKPOINTS, alone, read, only)
     if found is None:
         raise FileNotFoundError(f"{folder} has no checkpoint yet; let the training finish or save one")
     manifest, path, _ = found

@@ -52,10 +52,8 @@ def in_world(model: Model, frame: WorldFrame) -> Model:
     Positions stay relative to the model's origin in float32; the origin and the unit are float64.
     """
     space = model.space
-    origin = frame.to_world(np.array(space.offset))
-    moved = Space(
-        (origin[0].item(), origin[1].item(), origin[2].item()), space.unit * frame.scale, space.extent
-    )
+    x, y, z = frame.to_world(np.array(space.offset)).tolist()
+    moved = Space((x, y, z), space.unit * frame.scale, space.extent)
     if np.array_equal(frame.rotation, np.eye(3)):
         return replace(model, space=moved)
     rotation = torch.from_numpy(frame.rotation).to(model.means.device)

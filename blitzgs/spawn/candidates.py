@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from operator import itemgetter
 
 import torch
 from torch import Tensor
@@ -28,7 +27,7 @@ FEATURES = (
     "parent_flatness",
 )
 # The columns of a table that they are computed from.
-_COLUMNS_OF = itemgetter("grad_sum", "grad_count", "opacities", "scales", "birth", "level", "exp_avg_sq.sh")
+_COLUMNS = ("grad_sum", "grad_count", "opacities", "scales", "birth", "level", "exp_avg_sq.sh")
 
 
 @dataclass(frozen=True)
@@ -50,22 +49,15 @@ def spawn_features(
 ) -> Tensor:
     """Return the features of candidates at a density event, before its statistics are reset.
 
-    Args:
-        table: this rank's Gaussians, without pending optimiser steps.
-        rows: int64 [M], rows of the candidates' parents.
-        is_split: bool [M], whether the candidate is split; false: cloned.
-        time: time of the event, in images.
-        extent: extent of the scene, in the unit of the means.
+    `table`: this rank's Gaussians, without pending optimiser steps. `rows`: int64 [M], the parents.
+    `is_split`: bool [M], false: cloned. `time`: in images. `extent`: in the unit of the means.
 
-    Returns:
-        float32 [M, 10]: mean gradient over the views that saw the parent (half-image units), the parent's
-        opacity, the mean of its three scales relative to extent, its age in images, the number of these
-        views, the child's octree level (the parent's, one more for a split), the time, and whether it is a
-        split. These eight are the paper's. Then the root of Adam's mean squared gradient of the parent's
-        colour, which grows with the parent's weight in the images, and the ratio of the parent's smallest to
-        its largest scale.
+    Returns float32 [M, 10]: mean gradient over the views that saw the parent (half-image units), the parent's
+    opacity, the mean of its three scales relative to extent, its age in images, the number of these views,
+    the child's octree level (the parent's, one more for a split), the time, and whether it is a split. These
+    eight are the paper's. Then the root of Adam's mean squared gradient of the parent's colour, which grows
+    with the parent's weight in the images, and the ratio of the parent's smallest to its largest scale.
     """
+    columns = [table[name] for name in _COLUMNS]
     with below_autograd():
-        return torch.ops.blitzgs.spawn_features(
-            list(_COLUMNS_OF(table.columns)), rows, is_split, time, extent, level_count
-        )
+        return torch.ops.blitzgs.spawn_features(columns, rows, is_split, time, extent, level_count)

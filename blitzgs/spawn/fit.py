@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -18,8 +19,7 @@ from numpy.typing import NDArray
 
 from blitzgs.spawn.candidates import FEATURES
 from blitzgs.spawn.gate import GateInfo, SpawnGate, check_no_other, write_info
-from blitzgs.spawn.lineage import ABOUT
-from blitzgs.spawn.lineage_parts import read_lineage
+from blitzgs.spawn.lineage import ABOUT, read_lineage
 from blitzgs.util.charts import line_chart, maps
 from blitzgs.util.errors import optional_package
 from blitzgs.util.output import OutputFolder, write_file
@@ -61,18 +61,12 @@ class Spawns:
     @property
     def times(self) -> NDArray[np.float32]:
         """When they were born, images."""
-        times: NDArray[np.float32] = self.features[:, FEATURES.index("time")]
-        return times
+        return self.features[:, FEATURES.index("time")]
 
-    def only(self, rows: NDArray[np.bool_]) -> Spawns:
+    def only(self, rows: NDArray[Any]) -> Spawns:
         """Return some of the spawns."""
-        return dataclasses.replace(
-            self,
-            features=self.features[rows],
-            survived=self.survived[rows],
-            parents=self.parents[rows],
-            positions=self.positions[rows],
-        )
+        columns = ("features", "survived", "parents", "positions")
+        return dataclasses.replace(self, **{name: getattr(self, name)[rows] for name in columns})
 
 
 def read_spawns(folder: Path, gaussians: int | None = None) -> Spawns:
@@ -135,16 +129,11 @@ def check_outcomes(survived: NDArray[np.bool_], source: object) -> None:
 
 def with_distinct_names(runs: Sequence[Spawns]) -> list[Spawns]:
     """Number runs that have the same name (of their capture's folder): `capture`, `capture_2`."""
-    found: list[Spawns] = []
-    names: set[str] = set()
+    names: list[str] = []
     for run in runs:
-        name, number = run.name, 1
-        while name in names:
-            number += 1
-            name = f"{run.name}_{number}"
-        names.add(name)
-        found.append(dataclasses.replace(run, name=name))
-    return found
+        possible = itertools.chain([run.name], (f"{run.name}_{number}" for number in itertools.count(2)))
+        names.append(next(name for name in possible if name not in names))
+    return [dataclasses.replace(run, name=name) for run, name in zip(runs, names, strict=True)]
 
 
 def auc(scores: NDArray[Any], positive: NDArray[np.bool_]) -> float:
@@ -195,8 +184,7 @@ def fit(runs: Sequence[Spawns], path: Path, gate_from: float = 0.0) -> dict[str,
         figures.append(judge(held_out, scores, gate_from))
     protocol = "leave one scene out" if several else "a quarter of the parents held out"
     result = {"protocol": protocol, "held_out": figures}
-    booster = _train(xgboost, runs)
-    write_file(path, bytes(booster.save_raw("json")))
+    write_file(path, bytes(_train(xgboost, runs).save_raw("json")))
     write_info(path, GateInfo(FEATURES, runs[0].schedule, {run.name: run.scene for run in runs}, auc=result))
     return result
 
@@ -224,13 +212,11 @@ def judge(run: Spawns, scores: NDArray[Any], gate_from: float = 0.0) -> dict[str
 
 
 def _check_same_schedule(runs: Sequence[Spawns]) -> None:
-    """Check that all runs have the schedule of the first; the message names the fields that differ."""
     first = runs[0]
     for run in runs[1:]:
         fields = sorted(first.schedule.keys() | run.schedule.keys())
         pairs = [(name, first.schedule.get(name), run.schedule.get(name)) for name in fields]
-        differing = [f"{name} ({mine!r} and {other!r})" for name, mine, other in pairs if mine != other]
-        if differing:
+        if differing := [f"{name} ({mine!r} and {other!r})" for name, mine, other in pairs if mine != other]:
             raise ValueError(
                 f"{first.name} and {run.name} were trained with different schedules, and need a gate each: "
                 + ", ".join(differing)
@@ -239,14 +225,16 @@ def _check_same_schedule(runs: Sequence[Spawns]) -> None:
 
 def _train(xgboost: ModuleType, runs: Sequence[Spawns]) -> Any:
     generator = np.random.default_rng(0)
-    features, labels = [], []
-    for run in runs:
-        rows: Any = slice(None)
-        if len(run.survived) > MAX_ROWS:
-            rows = np.sort(generator.choice(len(run.survived), MAX_ROWS, replace=False))
-        features.append(run.features[rows])
-        labels.append(run.survived[rows])
-    data = xgboost.DMatrix(np.concatenate(features), np.concatenate(labels), feature_names=list(FEATURES))
+
+    def drawn(run: Spawns) -> Spawns:
+        if len(run.survived) <= MAX_ROWS:
+            return run
+        return run.only(np.sort(generator.choice(len(run.survived), MAX_ROWS, replace=False)))
+
+    parts = list(map(drawn, runs))
+    features = np.concatenate([part.features for part in parts])
+    labels = np.concatenate([part.survived for part in parts])
+    data = xgboost.DMatrix(features, labels, feature_names=list(FEATURES))
     # A row's weight in a leaf is p (1 - p), at most 1/4.
     least = {"min_child_weight": LEAF_SHARE * data.num_row() / 4}
     return xgboost.train(XGBOOST_PARAMETERS | least | {"seed": 0}, data, ROUNDS)
@@ -291,8 +279,7 @@ def evaluate(
             where, actual, predicted = region_rates(run.only(late), scores[late])
             result["regions"] = {"cells": int(where.sum()), "r": correlation(actual[where], predicted[where])}
             names = ("share that survived (orange: none, blue: all)", "share that the gate predicts")
-            picture = maps(dict(zip(names, (actual, predicted), strict=True)))
-            output.write(path, _utf8(picture))
+            output.write(path, _utf8(maps(dict(zip(names, (actual, predicted), strict=True)))))
         curves[run.name] = [(entry["until"], entry["survived"]) for entry in cohorts]
         results.append(result)
     chart = line_chart(curves, "born at, images", "share that reaches the final model", most=1.0)
@@ -309,12 +296,8 @@ def survival_by_cohort(run: Spawns) -> list[dict[str, float]]:
     """Return, for equal stretches of birth time, how many were born and which share of them survived."""
     edges = np.linspace(run.times.min(), run.times.max(), COHORTS + 1)
     cohort = np.clip(np.searchsorted(edges, run.times, side="left") - 1, 0, COHORTS - 1)
-    found = []
-    for k in range(COHORTS):
-        mine = run.survived[cohort == k]
-        if len(mine):
-            found.append({"until": float(edges[k + 1]), "born": len(mine), "survived": float(mine.mean())})
-    return found
+    parts = [(float(edge), run.survived[cohort == k]) for k, edge in enumerate(edges[1:])]
+    return [{"until": end, "born": len(own), "survived": float(own.mean())} for end, own in parts if len(own)]
 
 
 def region_rates(

@@ -78,21 +78,11 @@ def write_info(path: Path, info: GateInfo) -> None:
 
 def check_no_other(path: Path) -> None:
     """Refuse to replace files that are not a gate's, as its metadata show (FileExistsError, OSError)."""
-    metadata = info_path(path)
-    for file in (path, metadata):
-        check_replaceable(file)
-    foreign = metadata
-    try:
-        content = json.loads(metadata.read_text())
-        if isinstance(content, dict) and {"format", "features"} <= content.keys():
-            return
-    except FileNotFoundError:
-        if not path.exists():
-            return
-        foreign = path
-    except (ValueError, RecursionError):
-        pass
-    raise FileExistsError(f"{foreign} exists and does not belong to a gate: choose another --out")
+    metadata, otherwise = info_path(path), " and does not belong to a gate"
+    check_replaceable(metadata, (b'"features"',), otherwise)
+    check_replaceable(path)
+    if path.exists() and not metadata.exists():
+        raise FileExistsError(f"{path} exists{otherwise}: choose another name")
 
 
 def read_info(path: Path) -> GateInfo:

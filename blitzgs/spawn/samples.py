@@ -13,7 +13,7 @@ import torch
 from blitzgs.ops.counter_random import uniform
 from blitzgs.spawn.candidates import FEATURES
 from blitzgs.spawn.fit import AXES, Spawns, read_about, spawns_of
-from blitzgs.spawn.lineage_parts import check_columns, import_pyarrow, read_numbers
+from blitzgs.spawn.lineage import check_columns, import_pyarrow, read_numbers
 from blitzgs.util.output import check_replaceable, new_file
 
 SUFFIX = ".parquet"
@@ -37,14 +37,8 @@ def write_sample(run: Spawns, path: Path, most: int = MAX_ROWS) -> float:
     columns: dict[str, Any] = {"parent": some.parents, "survived": some.survived}
     columns |= dict(zip(AXES, some.positions.T, strict=True))
     columns |= dict(zip(FEATURES, some.features.T, strict=True))
-    about = {
-        "name": run.name,
-        "scene": run.scene,
-        "schedule": run.schedule,
-        "initial_survival": run.initial_survival,
-        "spawns": len(run.survived),
-        "rate": rate,
-    }
+    about = {name: getattr(run, name) for name in ("name", "scene", "schedule", "initial_survival")}
+    about |= {"spawns": len(run.survived), "rate": rate}
     table = arrow.table({name: np.ascontiguousarray(column) for name, column in columns.items()})
     table = table.replace_schema_metadata({_ABOUT: json.dumps(about)})
     # pyarrow takes no path that is not UTF-8, so it gets the open file.

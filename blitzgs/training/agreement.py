@@ -93,8 +93,8 @@ class SaveClock:
 class Decision:
     """What all ranks must do after a step."""
 
-    signal: str | None  # name of the signal that ends the run, or None
-    save: bool  # whether a checkpoint is due
+    signal: str | None = None  # name of the signal that ends the run, or None
+    save: bool = False  # whether a checkpoint is due
     written: bool = False  # whether all ranks have written their parts of the checkpoint that has begun
     lost: bool = False  # whether a rank could not read a photograph and continues without it
     watched: bool = False  # whether those who watch the run want something
@@ -127,17 +127,17 @@ class Agreement:
             return self.now(step, lost)
         if self._asked is None:
             if step < self._next:
-                return Decision(None, False)
+                return Decision()
             self._asked = self._ask(step, lost)
             if self._reads_late:
-                return Decision(None, False)
+                return Decision()
         return self._answer(step, *self._asked)
 
     def now(self, step: int, lost: bool = False) -> Decision:
         """Return a decision at once, whatever the step; every rank calls this."""
         if self._ranks.world_size == 1:
             clock = self._clock
-            return self._decision(self._stop.number, clock.is_due, clock.is_written, lost, self._wants())
+            return _decision(self._stop.number, clock.is_due, clock.is_written, lost, self._wants())
         return self._answer(step, *self._ask(step, lost))
 
     def _ask(self, step: int, lost: bool) -> tuple[int, HostCopy]:
@@ -160,8 +160,8 @@ class Agreement:
         interval = max(1, min(MAX_STEPS, int(MAX_SECONDS / max(slowest, 1e-9))))
         self._next, self._last = (asked // interval + 1) * interval, (step, time.monotonic())
         self._agreed_to_stop = number > 0
-        return self._decision(int(number), due > 0, not unwritten, any_lost > 0, watched > 0)
+        return _decision(int(number), due > 0, not unwritten, any_lost > 0, watched > 0)
 
-    @staticmethod
-    def _decision(number: int, due: bool, written: bool, lost: bool, watched: bool) -> Decision:
-        return Decision(signal.Signals(number).name if number else None, due, written, lost, watched)
+
+def _decision(number: int, *others: bool) -> Decision:
+    return Decision(signal.Signals(number).name if number else None, *others)

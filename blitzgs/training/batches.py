@@ -88,9 +88,8 @@ class _Slot:
         pixels = torch.empty((count, height, width, 3), dtype=torch.uint8, pin_memory=on_gpu)
         included = torch.empty((masked * count, height, width), dtype=torch.uint8, pin_memory=on_gpu)
         self._host = numbers, pixels, included
-        self._on_device = [
-            torch.empty_like(part, device=self._device) if on_gpu else part for part in self._host
-        ]
+        copies = (torch.empty_like(part, device=self._device) for part in self._host)
+        self._on_device = list(copies if on_gpu else self._host)
         self._shape = shape
         of_host, self.pixels, self.included = (part.numpy() for part in self._host)
         parts = [count * VIEW_NUMBERS, count * (VIEW_NUMBERS + 1)]
@@ -142,19 +141,15 @@ class BatchLoader:
         With `owners`, this rank decodes and uploads only the pixel rows that its tiles' loss reads.
         `random_background`: each view has a random colour behind everything.
         """
-        self._images = images
-        self._views = views
-        self._owners = owners
+        self._images, self._views, self._owners = images, views, owners
         self._sample_counts: dict[tuple[int, int], float] = {}  # by view and reduction
         self._masked: dict[int, bool] = {}  # of each view that was read, whether nearly all is masked
         # On several ranks, why this rank could not read the first of the photographs that it could not read.
         # It cannot stop alone in the middle of a step, so it continues and treats all pixels as masked.
         self.lost: str | None = None
         self.waited = 0.0  # seconds that the caller has waited for batches so far
-        self._train, self._random_background = train, random_background
-        self._sampler = sampler
-        self._device = device
-        self._ahead = ahead
+        self._train, self._sampler, self._random_background = train, sampler, random_background
+        self._device, self._ahead = device, ahead
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         self._plans: dict[int, _Plan] = {}  # by step
         # One slot is in use; the others hold batches that are ready or being prepared.
@@ -237,10 +232,8 @@ class BatchLoader:
 
     def _load(self, plan: _Plan) -> tuple[Batch, _Slot]:
         # Read before taking a slot, so that an unreadable image does not occupy one.
-        photographs = [
-            self._read(index, *needed, plan.reduction)
-            for index, needed in zip(plan.indices, plan.rows, strict=True)
-        ]
+        needed = zip(plan.indices, plan.rows, strict=True)
+        photographs = [self._read(index, *rows, plan.reduction) for index, rows in needed]
         slot = self._free.popleft()
         try:
             return self._fill(slot, plan, photographs), slot

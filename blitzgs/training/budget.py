@@ -69,8 +69,7 @@ class Budget:
         if self._seconds == 0 or step < self.next_step or step >= state.schedule.steps:
             return
         # Rank 0 decides, because the clocks of the ranks differ and all ranks must take the same steps.
-        plan = state.ranks.broadcast_object(self._plan(step) if state.ranks.rank == 0 else None)
-        assert plan is not None
+        plan = state.ranks.broadcast_object(self._plan(step) if state.ranks.rank == 0 else Plan(step))
         self.next_step = plan.next
         if plan.factor is not None:
             state.change_pace(plan.factor)
@@ -100,22 +99,16 @@ class Budget:
 
     def _report(self, plan: Plan) -> None:
         """Log a change of pace; print it too if the length of the run has changed by `SHOWN_CHANGE`."""
-        state = self._state
-        total = state.schedule.iterations
-        values = {
-            "images": total,
-            "scale": total / state.config.schedule.iterations,
-            "images_per_second": plan.images_per_second,
-            "seconds": plan.seconds,
-        }
-        text = None
+        state, total = self._state, self._state.schedule.iterations
+        speed, seconds = plan.images_per_second, plan.seconds
+        scale, text = total / state.config.schedule.iterations, None
         if abs(total - self._shown) > SHOWN_CHANGE * total:
             self._shown = total
             text = (
-                f"{plan.images_per_second:.1f} images/s: {total:,} images in all, a scale of "
-                f"{values['scale']:.3g}; will end after about {plan.seconds / 60:.3g} minutes (--minutes: "
-                f"{self._seconds / 60:.3g})"
+                f"{speed:.1f} images/s: {total:,} images in all, a scale of {scale:.3g}; will end after "
+                f"about {seconds / 60:.3g} minutes (--minutes: {self._seconds / 60:.3g})"
             )
+        values = {"images": total, "scale": scale, "images_per_second": speed, "seconds": seconds}
         state.log.event(state.images_seen, "pace", values, text)
 
 

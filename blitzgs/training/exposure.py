@@ -84,21 +84,18 @@ class Exposures:
             counted &= batch.ranges.pixel_mask(self._ranks.rank, targets.device)[pick]
         shown = (renders[pick].clamp(0, 1) * _UNIT).round().long()
         photo = targets * (_UNIT // 255)
-        ones = torch.ones_like(shown)
-        terms = torch.stack([ones, shown, photo, shown * shown, shown * photo])
+        terms = torch.stack([torch.ones_like(shown), shown, photo, shown * shown, shown * photo])
         sums = (terms * counted[..., None]).sum((2, 3))
-        self._update(batch.indices, self._ranks.all_reduce(sums).double())
-
-    def _update(self, indices: Sequence[int], sums: Tensor) -> None:
-        """Take sums, [5, B, 3], of 1, render, photograph, render^2 and render x photograph into account."""
-        count, shown, photo = sums[0].clamp(min=1), sums[1], sums[2]
-        shown, photo = shown / count / _UNIT, photo / count / _UNIT
-        variance = sums[3] / count / _UNIT**2 - shown * shown
-        covariance = sums[4] / count / _UNIT**2 - shown * photo
+        # Sums [B, 3] of 1, render, photograph, render^2 and render x photograph.
+        number, first, second, square, product = self._ranks.all_reduce(sums).double()
+        count = number.clamp(min=1)
+        first, second = first / count / _UNIT, second / count / _UNIT
+        variance = square / count / _UNIT**2 - first * first
+        covariance = product / count / _UNIT**2 - first * second
         gain = (covariance + _RIDGE) / (variance + _RIDGE)
-        found = torch.stack([gain, photo - gain * shown], dim=1)
-        rows = [self._rows[index] for index in indices]
-        share = (1 / (1 + self.counts[rows])).clamp(min=_LEAST_SHARE) * (sums[0, :, 0] > 0)
+        found = torch.stack([gain, second - gain * first], dim=1)
+        rows = [self._rows[index] for index in batch.indices]
+        share = (1 / (1 + self.counts[rows])).clamp(min=_LEAST_SHARE) * (number[:, 0] > 0)
         self.measured[rows] += share[:, None, None] * (found - self.measured[rows])
         self.counts[rows] += 1
 
@@ -119,11 +116,8 @@ class Exposures:
     def describe(self) -> dict[str, float]:
         """Return figures for the summary: spread and range of the gains in use, mean of the channels."""
         gains = self.effective()[:, 0].mean(1)
-        return {
-            "spread": gains.std(correction=0).item(),
-            "least": gains.min().item(),
-            "most": gains.max().item(),
-        }
+        found = {"spread": gains.std(correction=0), "least": gains.min(), "most": gains.max()}
+        return {name: value.item() for name, value in found.items()}
 
 
 # Photographs whose gains differ by less than this, as a standard deviation of their logarithms, have the same
@@ -150,8 +144,7 @@ def track_gains(capture: Capture, images: ImageStore, ranks: Ranks) -> Tensor | 
     it shows against the mean over the point's photographs, each divided by its own gain. Each rank reads its
     share of the photographs. None: the capture has no tracks.
     """
-    observed = _observed_points(capture)
-    if observed is None:
+    if (observed := _observed_points(capture)) is None:
         return None
     points, seen = observed
     own = list(range(ranks.rank, len(capture.train), ranks.world_size))
@@ -183,8 +176,7 @@ def _observed_points(capture: Capture) -> tuple[NDArray[np.float64], list[NDArra
     order = np.argsort(ids)
     offsets = model.images.point2d_offsets.astype(np.int64)
     seen = []
-    for name in wanted:
-        place = names[name]
+    for place in map(names.__getitem__, wanted):
         found = model.images.point3d_ids[offsets[place] : offsets[place + 1]]
         rows = order[np.searchsorted(ids, found[found >= 0], sorter=order).clip(max=len(ids) - 1)]
         seen.append(rows[:: max(1, len(rows) // _MAX_POINTS)].astype(np.int64))
@@ -204,8 +196,7 @@ def _colors(
     x, y, seen = x[inside].astype(np.int64), y[inside].astype(np.int64), seen[inside]
     colors = cv2.blur(images.get(index).numpy(), (_BLUR, _BLUR))[y, x].astype(np.float64)
     good = ((colors > _DARKEST_MEAN) & (colors < _BRIGHTEST_MEAN)).all(1)
-    mask = images.mask(index)
-    if mask is not None:
+    if (mask := images.mask(index)) is not None:
         good &= mask.numpy()[y, x] != 0
     return seen[good], np.log(colors[good])
 

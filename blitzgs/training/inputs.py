@@ -65,10 +65,7 @@ def open_capture(
     if not data.path:
         raise ConfigError("data.path: no capture given; use --data DIR")
     try:
-        if reading is not None:
-            capture = reading.result()
-        else:
-            capture = load_configured(data, partial(_damaged_of_share, ranks))
+        capture = reading.result() if reading else load_configured(data, partial(_damaged_of_share, ranks))
     except MissingImagesError as error:
         raise MissingImagesError(f"{error} ({remedy})") from error
     budget = min(data.cache_bytes, _host_memory() // 2)
@@ -155,10 +152,7 @@ def _host_memory() -> int:
 
 
 def check_capture(space: Space, capture: Capture, folder: Path) -> None:
-    """Check that a capture is the one that the run in `folder` was trained on.
-
-    ValueError: its cameras are elsewhere.
-    """
+    """Check that a capture is the one of the run in `folder` (ValueError: its cameras are elsewhere)."""
     if Space.of(capture.offset, capture.extent) != space:
         raise ValueError(f"{capture.root} is not the capture of the run in {folder}: its cameras differ")
 
@@ -193,10 +187,7 @@ def mean_colour(capture: Capture, images: ImageStore) -> tuple[float, float, flo
 
 
 def check_resolution(config: Config, capture: Capture) -> None:
-    """Check that the photographs are large enough for `schedule.resolution`.
-
-    ConfigError: one of them is not.
-    """
+    """Check that the photographs are large enough for `schedule.resolution` (else ConfigError)."""
     most = max((factor for factor, _ in config.schedule.resolution), default=1)
     sizes = {(capture.cameras[index].width, capture.cameras[index].height) for index in capture.train}
     width, height = min(sizes, key=min)
@@ -214,14 +205,11 @@ def check_alike(config: Config, capture: Capture, ranks: Ranks, resume: bool, ex
     """
     if ranks.world_size == 1:
         return
-    fields = {
-        f"configuration field {name}": value
-        for name, value in flat(to_dict(config)).items()
-        if name not in HOST_FIELDS
-    }
-    flags = {"flag --resume": resume, "flag --extend": extend}
+    fields = flat(to_dict(config)).items()
     ranks.compare_across_ranks(
-        {"code version": code_fingerprint(), "capture": capture_fingerprint(capture)} | flags | fields
+        {"code version": code_fingerprint(), "capture": capture_fingerprint(capture)}
+        | {"flag --resume": resume, "flag --extend": extend}
+        | {f"configuration field {name}": value for name, value in fields if name not in HOST_FIELDS}
     )
 
 

@@ -42,13 +42,11 @@ def population_report(state: TrainingState, memory_samples: Sequence[int]) -> di
     """
     progress = state.progress
     counts = progress.milestones | {"peak": progress.peak_gaussians, "final": state.population()}
-    mean = round(fmean(memory_samples)) if memory_samples else None
-    memory = state.ranks.all_gather_object((peak_memory_bytes(state.ranks.device), mean))
+    own = peak_memory_bytes(state.ranks.device), round(fmean(memory_samples)) if memory_samples else None
+    peaks, means = zip(*state.ranks.all_gather_object(own), strict=True)
     report: dict[str, Any] = {name: counts[name] for name in _MILESTONES if name in counts}
-    report["peak_memory_bytes"] = [peak for peak, _ in memory]
-    if all(mean is not None for _, mean in memory):
-        report["mean_memory_bytes"] = [mean for _, mean in memory]
-    return report
+    report["peak_memory_bytes"] = list(peaks)
+    return report if None in means else report | {"mean_memory_bytes": list(means)}
 
 
 def describe(report: dict[str, Any]) -> str:
@@ -120,9 +118,8 @@ def measure_step(state: TrainingState, frame: Frame, batch: Batch) -> HostCopy:
     loss, extent, table = state.config.loss, state.space.extent, state.stepper.table
     assert frame.active is not None  # as in every step of a training
     active = frame.active.considered()
-    visible, population = (
-        active.new_full((), count) for count in (len(frame.projected.visible_ids), len(state.table))
-    )
+    numbers = len(frame.projected.visible_ids), len(state.table)
+    visible, population = (active.new_full((), number) for number in numbers)
     counts = state.ranks.all_reduce(torch.stack([find_bad(table), active, visible, population]))
     scale = opacity = batch.samples.new_zeros(())
     if loss.scale > 0:

@@ -20,7 +20,6 @@ no label, because they never became Gaussians.
 from __future__ import annotations
 
 import json
-import math
 import os
 import shutil
 from collections.abc import Iterator
@@ -37,14 +36,13 @@ from blitzgs.capture.images import ImageStore
 from blitzgs.config.fields import Config
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
-from blitzgs.distributed.selection import decimal_share, smallest
 from blitzgs.ops.counter_random import hash_keys
 from blitzgs.runs import run_files
 from blitzgs.runs.checkpoint_files import MANIFEST
 from blitzgs.runs.folder_checks import locked
 from blitzgs.spawn.candidates import Candidates, Veto
-from blitzgs.spawn.gate import SpawnGate, random_veto, rank_veto, sampled_veto, veto_draws
-from blitzgs.spawn.lineage_parts import read_lineage
+from blitzgs.spawn.gate import SpawnGate, random_veto, rank_veto, sampled_veto, veto_draws, veto_lowest
+from blitzgs.spawn.lineage import read_lineage
 from blitzgs.training.trainer import Trainer
 from blitzgs.util.errors import warn
 
@@ -54,22 +52,6 @@ FIGURES, TABLE = "replay.json", "replay.md"
 # An empty file in the folder of the reference until this arm is trained: a replay that ended before that
 # begins again.
 BEGUN = "replay_begun"
-
-
-class CandidateRecord:
-    """Vetoes nothing, and records the candidates of a run before the limit of the population applies."""
-
-    def __init__(self) -> None:
-        self._keys: list[Tensor] = []
-
-    def __call__(self, candidates: Candidates, ranks: Ranks) -> Tensor:
-        """Record candidates, and return that none is vetoed, bool [M]."""
-        self._keys.append(event_keys(candidates.parents, candidates.time, candidates.is_split).cpu())
-        return torch.zeros_like(candidates.is_split)
-
-    def of_all_ranks(self, ranks: Ranks) -> Tensor:
-        """Return the `event_keys` of all candidates, int64 [K] on the CPU. Collective."""
-        return torch.cat(ranks.all_gather_object(torch.cat([torch.empty(0, dtype=torch.int64), *self._keys])))
 
 
 class OracleVeto:
@@ -91,15 +73,8 @@ class OracleVeto:
         dead = torch.isin(keys, self._dead.to(keys.device))
         if self._rate is None:
             return dead
-        vetoed = torch.zeros_like(dead)
-        for group in (~candidates.is_split, candidates.is_split):
-            counts = torch.stack((group.sum(), (group & dead).sum()))
-            total, dying = ranks.all_reduce(counts).tolist()
-            most = math.ceil(decimal_share(self._rate) * total)
-            rows = (group & dead).nonzero().squeeze(1)
-            draws = veto_draws(candidates, self._seed)[rows].float()
-            vetoed[rows] = smallest(draws, candidates.parents[rows], min(most, dying), ranks)
-        return vetoed
+        draws = veto_draws(candidates, self._seed).float()  # below 1
+        return dead & veto_lowest(draws.where(dead, 2.0), candidates, self._rate, ranks)
 
 
 def event_keys(parents: Tensor, times: Tensor | int, is_split: Tensor) -> Tensor:
@@ -112,9 +87,8 @@ def label_events(lineage: Path) -> tuple[Tensor, Tensor]:
     tables = read_lineage(lineage)
     births, deaths = tables["births"], tables["deaths"]
     spawned = births["parent"] >= 0
-    parents, times, splits = (
-        torch.from_numpy(births[name][spawned]) for name in ("parent", "time", "is_split")
-    )
+    columns = (births[name][spawned] for name in ("parent", "time", "is_split"))
+    parents, times, splits = map(torch.from_numpy, columns)
     keys = event_keys(parents, times.long(), splits.bool()).numpy()
     survived = ~np.isin(births["id"][spawned], deaths["id"])
     known = np.unique(keys)
@@ -174,11 +148,11 @@ def replay(
     Yields, for each arm: its name, psnr, ssim, peak and final Gaussians, the seconds of training since the
     branch, the reference's share of non-surviving events (`dead`) and of candidates that the limit of the
     population held back (`held_back`), and of an oracle the share of the candidates that it knew (`matched`).
+    A replay that ended before its first arm was trained is begun again.
 
     ValueError, FileNotFoundError: the run cannot be branched, or its arms could not be compared.
-    FileExistsError: `out` holds a replay already, or another folder with the name of an arm; a replay that
-    ended before its first arm was trained is begun again. FolderError: another process is training in the
-    folder of an arm.
+    FileExistsError: `out` holds a replay already, or another folder with the name of an arm. FolderError:
+    another process is training in the folder of an arm.
     """
     _check_comparable(config, capture, images, source)
     _check_unclaimed(out, ranks)
@@ -202,9 +176,15 @@ def replay(
         found = {short: summary[long] for short, long in figures.items()}
         return {"arm": name, **found, "seconds": summary["seconds"] - began}
 
-    record = CandidateRecord()
+    candidates_met = [torch.empty(0, dtype=torch.int64)]
+
+    def record(candidates: Candidates, ranks: Ranks) -> Tensor:
+        """Veto nothing, and note the candidates before the limit of the population applies."""
+        candidates_met.append(event_keys(candidates.parents, candidates.time, candidates.is_split).cpu())
+        return torch.zeros_like(candidates.is_split)
+
     reference = train(REFERENCE, record)
-    known = record.of_all_ranks(ranks)
+    known = torch.cat(ranks.all_gather_object(torch.cat(candidates_met)))
     spawned, dead = label_events(out / REFERENCE / run_files.LINEAGE)
     held_back = _held_back(known, spawned, ranks)
     if ranks.rank == 0:
@@ -263,11 +243,8 @@ def _branch(point: Path, folder: Path) -> None:
 
 
 def _check_comparable(config: Config, capture: Capture, images: ImageStore, source: Path) -> None:
-    """Check that arms can be branched from a run and that their results can be compared."""
     if not config.population.lineage:
-        raise ValueError(
-            f"{source} was trained without --population.lineage=true: there is nothing to branch"
-        )
+        raise ValueError(f"{source} was trained without --population.lineage=true: nothing can be branched")
     if config.population.strategy == "relocation":
         raise ValueError(
             f"{source} was trained with population.strategy=relocation, which has no candidates: replay a "

@@ -72,7 +72,8 @@ class BatchSampler:
         """Return the B views of a step (0-based); a view repeats only where its group's epochs meet."""
         first, batches = self._round
         if not first <= step < first + len(batches):
-            index = self._round_of(step)
+            # The last round that starts at or before the step and is not empty.
+            index = bisect_right(range(1 << 60), step, key=self._batches_before) - 1
             first, batches = self._round = self._batches_before(index), self._batches_of(index)
         group, batch = batches[step - first]
         begin = batch * self.batch_size
@@ -90,22 +91,15 @@ class BatchSampler:
     def _draw(self, block: int) -> Tensor:
         return uniform(torch.arange(_DRAWN * 3 * self.batch_size), self._seed, block, 3).view(_DRAWN, -1, 3)
 
-    def _group_batches(self, size: int, rounds: int) -> int:
-        return rounds * size // self.batch_size
-
     def _batches_before(self, rounds: int) -> int:
-        return sum(self._group_batches(count, rounds) for count in self._counts)
-
-    def _round_of(self, step: int) -> int:
-        """Find the last round that starts at or before `step` and is not empty."""
-        return bisect_right(range(1 << 60), step, key=self._batches_before) - 1
+        return sum(rounds * count // self.batch_size for count in self._counts)
 
     def _make_round(self, index: int) -> list[tuple[int, int]]:
         """List the batches of a round in their order: group, and number within the group."""
         slots = [
             (g, k)
             for g, count in enumerate(self._counts)
-            for k in range(self._group_batches(count, index), self._group_batches(count, index + 1))
+            for k in range(index * count // self.batch_size, (index + 1) * count // self.batch_size)
         ]
         if self._places is not None:
             return sorted(slots, key=lambda slot: self._at(slot[0], slot[1] * self.batch_size)[:2])
@@ -120,9 +114,8 @@ class BatchSampler:
         else:
             begin, direction = uniform(torch.arange(2), self._seed, epoch, 2)
             places = (self._places[views] + begin) % 1.0
-            keys = (places if direction < 0.5 else 1.0 - places) + _PIECE * uniform(
-                views, self._seed, epoch, 0
-            )
+            delays = _PIECE * uniform(views, self._seed, epoch, 0)
+            keys = (places if direction < 0.5 else 1.0 - places) + delays
         order = keys.argsort(stable=True)
         return views[order].tolist(), keys[order].tolist()
 
@@ -145,5 +138,4 @@ def tour_of(cameras: Sequence[Camera], points: Float64) -> list[int]:
     middles = np.array([np.median(seen) if len(seen) else 0.0 for seen in depths])
     # Row 2 of a pose is the optical axis.
     places = camera_centres(poses) + middles[:, None] * poses[:, 2, :3]
-    order: list[int] = morton_order(torch.from_numpy(places)).tolist()
-    return order
+    return morton_order(torch.from_numpy(places)).tolist()

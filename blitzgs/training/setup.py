@@ -64,18 +64,14 @@ def set_up(
 ) -> TrainingState:
     """Make the state of a new run, or restore the state of the run in `folder`.
 
-    Args:
-        folder: folder of the run, for configuration, log, checkpoints, evaluation and summary.
-        resume: continue from the newest checkpoint in `folder`, if there is one.
-        extend: with `resume`, train a finished run longer, see `budget.extended`.
-        lap: called with the name of each part of this work at its end (`Laps.lap`).
+    `resume`: continue from the newest checkpoint in `folder`, if there is one. `extend`: with `resume`, train
+    a finished run longer, see `budget.extended`. `lap` is called with the name of each part of this work at
+    its end (`Laps.lap`).
 
-    Raises:
-        FileExistsError: the folder holds a trained run and `resume` is not set, or files of another program.
-        ConfigError: the run to resume was started with another configuration.
-        GateError: the spawn gate cannot be read, or differs from that of the run to resume.
-        MismatchError: the ranks differ in configuration, code or capture.
-        FolderError: a rank cannot write to the folder, or the disk has too little space.
+    FileExistsError: the folder holds a trained run and `resume` is not set, or files of another program.
+    ConfigError: the run to resume was started with another configuration. GateError: the spawn gate cannot be
+    read, or differs from that of the run to resume. MismatchError: the ranks differ in configuration, code or
+    capture. FolderError: a rank cannot write to the folder, or the disk has too little space.
     """
     # Everything that may refuse the run comes before the first file is written, so that a refused run leaves
     # its folder as it was. The ranks are compared before they work together, and the folder is checked before
@@ -170,11 +166,10 @@ def _resolved(
 ) -> Config:
     """Return `config` with the values that depend on the training views and on what the run has measured.
 
-    The depths of what the views see decide on the near plane (`model.near`), and the colours of the
-    photographs on the background. The number of views decides the
-    length of the run (`schedule.images_per_view`) and the opacity term (`loss.opacity_total`). A run that is
-    resumed with fewer or more photographs (`data.allow_missing`) keeps the values that it began with.
-    `with_pace_of` says what a run measures.
+    The depths of what the views see decide on the near plane, the colours of the photographs on the
+    background, the number of views on the length of the run and the opacity term. A run that is resumed with
+    fewer or more photographs (`data.allow_missing`) keeps the values that it began with. `with_pace_of` says
+    what a run measures.
     """
     saved = None if restored is None else restored.config
     if saved is not None and not same_views:
@@ -283,7 +278,6 @@ def _start_lineage(
 
 
 def _origin(restored: TrainedModel | None, resume: bool, folder: Path, schedule: Schedule) -> str:
-    """Describe where the run begins, for the log."""
     if restored is not None:
         more = ""
         if Schedule(restored.config.schedule).iterations != schedule.iterations:

@@ -181,8 +181,7 @@ class TrainingState:
 
     def change_pace(self, factor: float) -> None:
         """Multiply `schedule.scale` by `factor` from now on; every rank calls this."""
-        schedule = self.config.schedule
-        pace = (*schedule.pace, (self.images_seen, factor))
+        pace = (*self.config.schedule.pace, (self.images_seen, factor))
         self.config = changed(self.config, "schedule", pace=pace)
         self.schedule = Schedule(self.config.schedule)
         self.optimiser.follow(self.schedule)
@@ -196,5 +195,4 @@ class TrainingState:
 
     def population(self) -> int:
         """Count the Gaussians of all ranks; every rank calls this."""
-        count = torch.tensor([len(self.table)], device=self.ranks.device)
-        return int(self.ranks.all_reduce(count).item())
+        return int(self.ranks.all_reduce(torch.tensor(len(self.table), device=self.ranks.device)))

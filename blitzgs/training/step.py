@@ -34,9 +34,8 @@ class Stepper:
 
     # The rows to which a frame's ids refer: all of this rank's Gaussians, or those of a pool.
     table: GaussianTable
-    gaussians: (
-        TableOrPool  # all of this rank's Gaussians, for rendering between steps; call `catch_up` before
-    )
+    # All of this rank's Gaussians, for rendering between steps; call `catch_up` before.
+    gaussians: TableOrPool
     exposures: Exposures | None = None  # of the training photographs; None: all are taken as they are
 
     def __init__(
@@ -92,15 +91,15 @@ class Stepper:
         table, ranks, views = self.table, self._owners.ranks, batch.views
         rules = None if view_filter is None else view_filter.rules(table)
         assignment = None if batch.ranges is None else TileAssignment(ranks, batch.ranges)
-        on_gpu = views.viewmats.is_cuda
 
         def active(capacity: Sizes | None) -> ActiveRows:  # an attempt that lacks room repeats this
-            # On the CPU the number of blocks is known at once: lists of this size need no estimate, and are
-            # complete at the first attempt.
-            capacity_blocks = capacity.blocks if capacity is not None and on_gpu else None
-            rows = self._blocks.active(table, views, options.limits, rules, capacity_blocks)
-            if not on_gpu:
-                rows = rows._replace(blocks=None)
+            if views.viewmats.is_cuda:
+                blocks = None if capacity is None else capacity.blocks
+                rows = self._blocks.active(table, views, options.limits, rules, blocks)
+            else:
+                # The number of blocks is known at once: lists of this size need no estimate, and are complete
+                # at the first attempt.
+                rows = self._blocks.active(table, views, options.limits, rules)._replace(blocks=None)
             stage_ended("other")
             self._optimiser.catch_up(table, rows.ids, step - 1, rows.length)
             stage_ended("optimiser")
@@ -108,9 +107,8 @@ class Stepper:
                 gate_views_(rows, table["means"], views.viewmats, rules)
             return rows
 
-        frame = render_frame(
-            table, views, options, active, assignment, self._transport, True, batch.backgrounds
-        )
+        way = assignment, self._transport
+        frame = render_frame(table, views, options, active, *way, True, batch.backgrounds)
         if self.exposures is None:
             terms = loss_terms(frame, batch, self._loss, self._extent)
         else:
@@ -134,16 +132,14 @@ class Stepper:
 
         With `keep_means2d`, returns the gradient of the splats' means2d, [P, 2] per pixel.
         """
-        table, visible_ids = self.table, frame.projected.visible_ids
+        table, ids = self.table, frame.projected.visible_ids
         gradients = backward_splats(frame, terms.v_renders)
         self._optimiser.step(table, frame, gradients, terms.scale_reg, terms.opacity_reg, step)
         if self._limit > 0:
-            limit_scales_(
-                table["scales"], table["means"], visible_ids, share=self._limit, extent=self._extent
-            )
+            limit_scales_(table["scales"], table["means"], ids, share=self._limit, extent=self._extent)
         if self._noise is not None:
-            self._noise.add(table, visible_ids, step, self._optimiser.position_rate(step))
+            self._noise.add(table, ids, step, self._optimiser.position_rate(step))
         stage_ended("optimiser")
-        self._blocks.update(table, visible_ids)
+        self._blocks.update(table, ids)
         stage_ended("other")
         return gradients.means2d if keep_means2d else None

@@ -9,7 +9,7 @@ import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -29,7 +29,7 @@ from blitzgs.runs.log import RunLog
 from blitzgs.spawn.gate import lineage_subject
 from blitzgs.table.pool import PoolError
 from blitzgs.training import view_level
-from blitzgs.training.agreement import MAX_STEPS, Agreement, Decision, StopRequest
+from blitzgs.training.agreement import MAX_STEPS, Agreement, StopRequest
 from blitzgs.training.batches import MAX_MASKED, BatchLoader
 from blitzgs.training.budget import Budget
 from blitzgs.training.events import evaluate, handle_all, save
@@ -139,8 +139,7 @@ class Trainer:
         budget, glances = Budget(state), Glances(state)
         # What a stop kept from happening after the last step comes first.
         if not handle_all(state, [Event(*entry) for entry in state.progress.events_left]):
-            self._stop_by(agreement.now(done).signal)
-            return False
+            return self._stop_by(agreement.now(done).signal)
         # The budget may change the number of steps.
         while (step := state.progress.step + 1) <= state.schedule.steps:
             with self._saved_for_lack_of_room("a step", is_saved=step == done + 1):
@@ -148,36 +147,28 @@ class Trainer:
             if step == done + 1:
                 self._laps.lap("first step")
                 state.log.event(step * size, "setup", self._laps.seconds, self._laps.text())
-            if events := state.schedule.events((step - 1) * size, step * size):
-                with self._saved_for_lack_of_room("an event"):
-                    all_ran = handle_all(state, events)
-                if not all_ran:
-                    self._stop_by(agreement.now(step).signal)
-                    return False
+            with self._saved_for_lack_of_room("an event"):
+                all_ran = handle_all(state, state.schedule.events((step - 1) * size, step * size))
+            if not all_ran:
+                return self._stop_by(agreement.now(step).signal)
             budget.after(step)
             glances.after((step - 1) * size, step * size)
             if step == state.schedule.steps:
                 break
             decision = agreement.after(step, self.loader.lost is not None)
             if decision.signal is not None:
-                self._stop_by(decision.signal)
-                return False
+                return self._stop_by(decision.signal)
             if decision.lost:
                 break
-            self._carry_out(decision)
+            if decision.save:
+                with state.stage("checkpoint"):
+                    save.save_checkpoint(state)
+            if decision.written:
+                with state.stage("checkpoint"):
+                    save.finish_checkpoint(state)
+            if decision.watched:
+                self._watching.serve(state.stops)
         return True
-
-    def _carry_out(self, decision: Decision) -> None:
-        """Save, and serve the watcher, as the ranks have decided."""
-        state = self.state
-        if decision.save:
-            with state.stage("checkpoint"):
-                save.save_checkpoint(state)
-        if decision.written:
-            with state.stage("checkpoint"):
-                save.finish_checkpoint(state)
-        if decision.watched:
-            self._watching.serve(state.stops)
 
     @contextlib.contextmanager
     def _saved_for_lack_of_room(self, what: str, is_saved: bool = False) -> Iterator[None]:
@@ -197,12 +188,11 @@ class Trainer:
         reasons = self.state.ranks.all_gather_object(self.loader.lost)
         lost = [f"rank {rank}: {reason}" for rank, reason in enumerate(reasons) if reason is not None]
         if lost:
-            raise PhotographError(
-                f"{'; '.join(lost)}. The last steps, {MAX_STEPS + 1} at most, went without it"
-            )
+            raise PhotographError(f"{'; '.join(lost)}. Up to {MAX_STEPS + 1} last steps went without it")
 
-    def _stop_by(self, signal: str | None, saves: bool = True) -> None:
+    def _stop_by(self, signal: str | None, saves: bool = True) -> Literal[False]:
         self._stop(f"stopped by {signal}; continue with --resume", saves)
+        return False
 
     def _stop(self, reason: str, saves: bool = True) -> None:
         """Save a checkpoint, and log why the run stops."""
@@ -216,10 +206,9 @@ class Trainer:
         self._watching.close()
         for text in dict.fromkeys(self.warned):
             state.log.event(state.images_seen, "warned", {"warning": text})
-        self.loader.close()
-        self.state.log.close()
-        if self.state.lineage is not None:
-            self.state.lineage.close()
+        for opened in (self.loader, state.log, state.lineage):
+            if opened is not None:
+                opened.close()
 
     def step(self, step: int) -> None:
         """Take optimiser step number `step` (from 1), without the schedule's events."""
@@ -240,9 +229,7 @@ class Trainer:
         self._guard.check(step, names, sums, state.stepper.table, frame)
         is_logged = end // config.log.every > begin // config.log.every
         figures = measure_step(state, frame, batch) if is_logged else None
-        v_means2d = state.stepper.backward(
-            step, frame, terms, keep_means2d=schedule.gathers_statistics(begin)
-        )
+        v_means2d = state.stepper.backward(step, frame, terms, schedule.gathers_statistics(begin))
         if v_means2d is not None:
             self._add_statistics(frame, v_means2d, reduction)
         state.stepped(step, degree)
@@ -258,10 +245,8 @@ class Trainer:
     def _check_masks(self) -> None:
         """Warn once if masks exclude nearly all of some training views, as inverted masks do."""
         masked, read = self.loader.views_masked
-        if not masked or self._warned_of_masks:
-            return
-        self._warned_of_masks = True
-        if self.state.ranks.rank == 0:
+        if masked and not self._warned_of_masks and self.state.ranks.rank == 0:
+            self._warned_of_masks = True
             warn(
                 f"{masked} of the first {read} training views are masked by more than {MAX_MASKED:.0%}: "
                 "black excludes a pixel and white counts. Invert the masks if they mean the opposite, or "
@@ -292,7 +277,6 @@ class Trainer:
         density_stats_(*statistics, *of_splats, views.width, views.height, float(len(views)), phi)
 
     def _announce(self) -> None:
-        """Log the start of the training: origin, population, views and ranks."""
         state, ranks = self.state, self.state.ranks
         views = {"train": len(state.capture.train), "test": len(state.capture.test)}
         images = state.schedule.iterations
@@ -311,10 +295,9 @@ class Trainer:
             text += f"; {ranks.world_size} ranks, transport {ranks.transport}"
         if state.config.schedule.minutes > 0:
             text += f"; {state.config.schedule.minutes:g} minutes of training"
-        values = views | versions(ranks.device) | {"transport": ranks.transport}
-        state.log.event(
-            state.images_seen, "start", {"origin": state.origin} | values, f"{state.origin}; {text}"
-        )
+        values: dict[str, Any] = views | versions(ranks.device) | {"transport": ranks.transport}
+        values |= {"origin": state.origin}
+        state.log.event(state.images_seen, "start", values, f"{state.origin}; {text}")
         for hint in hints_of(state):
             state.log.event(state.images_seen, "hint", {"hint": hint}, hint)
 

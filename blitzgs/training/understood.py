@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,18 +50,19 @@ class Pictures:
 def check_worlds(capture: Capture) -> None:
     """Refuse a capture of which no view sees a point (HopelessCaptureError: see above)."""
     views = len(capture.cameras)
-    if capture.about.blind == views and capture.about.random_points:
+    if capture.about.blind < views:
+        return
+    if capture.about.random_points:
         raise HopelessCaptureError(
             f"{capture.root} has no points, and its cameras do not say where the scene is: put the points of "
             "the reconstruction into the folder (PLY, LAS, LAZ or E57 for another program's project)"
         )
-    if capture.about.blind == views:
-        raise HopelessCaptureError(
-            f"{views} of {views} views see none of the {len(capture.points):,} points, so there is nothing "
-            f"to train: the cameras of {capture.about.cameras} and the points have different worlds "
-            "(give points that were reconstructed with these cameras, in the same coordinates), or the "
-            "cameras look along another axis than +z (COLMAP) or -z (transforms.json)"
-        )
+    raise HopelessCaptureError(
+        f"{views} of {views} views see none of the {len(capture.points):,} points, so there is nothing "
+        f"to train: the cameras of {capture.about.cameras} and the points have different worlds "
+        "(give points that were reconstructed with these cameras, in the same coordinates), or the "
+        "cameras look along another axis than +z (COLMAP) or -z (transforms.json)"
+    )
 
 
 def understood(config: Config, capture: Capture, images: ImageStore) -> list[str]:
@@ -164,29 +167,27 @@ def _warn_of_pictures(capture: Capture, pictures: Pictures, near: float) -> None
 
 def _photographs(capture: Capture) -> str:
     about = capture.about
-    parts = [f"{len(capture.cameras)} used: {len(capture.train)} to train, {len(capture.test)} held out"]
-    for count, text in (
-        (about.without_camera, "without a camera"),
-        (about.unused, "in no list of the capture's split"),
-        (about.missing, "not on disk"),
-        (about.damaged, "damaged"),
-    ):
-        if count:
-            parts.append(f"{count} {text}")
-    return "; ".join(parts)
+    left_out = {
+        "without a camera": about.without_camera,
+        "in no list of the capture's split": about.unused,
+        "not on disk": about.missing,
+        "damaged": about.damaged,
+    }
+    used = f"{len(capture.cameras)} used: {len(capture.train)} to train, {len(capture.test)} held out"
+    return "; ".join([used, *(f"{count} {text}" for text, count in left_out.items() if count)])
 
 
 def _held_out(capture: Capture) -> str:
+    why, source = capture.about.split, capture.about.split_from
+    if source and why == "the capture's own split":
+        why = f"{why}, {source}"
     if not capture.test:
-        return f"none ({_why_split(capture)})"
-    names = ", ".join(capture.cameras[i].name for i in capture.test[:4])
-    return f"{_why_split(capture)}: {names}{', ...' if len(capture.test) > 4 else ''}"
+        return f"none ({why})"
+    return f"{why}: {_first_few(capture.cameras[i].name for i in capture.test)}"
 
 
-def _why_split(capture: Capture) -> str:
-    source = capture.about.split_from
-    own = capture.about.split == "the capture's own split"
-    return f"{capture.about.split}, {source}" if own and source else capture.about.split
+def _first_few(names: Iterable[str]) -> str:
+    return ", ".join(name if k < 4 else "..." for k, name in enumerate(itertools.islice(names, 5)))
 
 
 def _strays(capture: Capture) -> str:
@@ -194,12 +195,9 @@ def _strays(capture: Capture) -> str:
     if not strays:
         return "none"
     names = {camera.name for camera in capture.cameras}
-    shown = ", ".join(f"{stray.name} at {stray.distance:.6g}" for stray in strays[:4])
+    shown = _first_few(f"{stray.name} at {stray.distance:.6g}" for stray in strays)
     state = "kept" if any(stray.name in names for stray in strays) else "left out"
-    return (
-        f"{len(strays)} {state}: {shown}{', ...' if len(strays) > 4 else ''} (the others are within "
-        f"{strays[0].others:.6g})"
-    )
+    return f"{len(strays)} {state}: {shown} (the others are within {strays[0].others:.6g})"
 
 
 def _sizes(capture: Capture, downscale: float) -> str:
@@ -216,10 +214,8 @@ def _masks(capture: Capture, pictures: Pictures) -> str:
         return "none"
     parts = [f"{files} of {len(capture.cameras)} photographs have one"] if files else []
     parts += [f"{borders} have masked borders (data.undistort=mask)"] if borders else []
-    if pictures.masked:
-        parts.append(
-            f"mean share excluded {np.mean(pictures.masked):.1%} of {len(pictures.masked)} looked at"
-        )
+    if some := pictures.masked:
+        parts.append(f"mean share excluded {np.mean(some):.1%} of {len(some)} looked at")
     return "; ".join(parts)
 
 
@@ -237,13 +233,11 @@ def _alpha(capture: Capture, config: Config) -> str:
 def _points(capture: Capture) -> str:
     if capture.about.random_points:
         return f"none; {len(capture.points):,} random ones"
-    colours = capture.colors
-    grey = bool((colours == colours[:1]).all())
-    shown = (
-        f"all of colour {tuple(colours[0].tolist())}" if grey else f"mean colour {colours.mean():.0f} of 255"
-    )
-    blind = f"; {capture.about.blind} views see none" if capture.about.blind else ""
-    about = capture.about
+    about, colours = capture.about, capture.colors
+    shown = f"mean colour {colours.mean():.0f} of 255"
+    if (colours == colours[:1]).all():
+        shown = f"all of colour {tuple(colours[0].tolist())}"
+    blind = f"; {about.blind} views see none" if about.blind else ""
     colours_from = f"colours from {about.colors_from}" if about.colors_from else "no colours in the file"
     return f"{len(capture.points):,} of {about.points_from}, {colours_from}, {shown}{blind}"
 
@@ -253,12 +247,9 @@ def _exposure(pictures: Pictures) -> str:
         return f"unknown: {pictures.unread[0]}" if pictures.unread else "unknown: all pixels are masked"
     means = np.array(pictures.means)
     stops = float(np.log2(max(means.max(), 1.0) / max(means.min(), 1.0))) * 2.2  # of linear light, by sRGB
-    text = (
-        f"means of {len(means)} photographs {means.min():.0f} to {means.max():.0f} of 255 ({stops:.1f} stops)"
-    )
-    return text + (
-        f"; {len(pictures.unread)} cannot be read: {pictures.unread[0]}" if pictures.unread else ""
-    )
+    lost = f"; {len(pictures.unread)} cannot be read: {pictures.unread[0]}" if pictures.unread else ""
+    span = f"{means.min():.0f} to {means.max():.0f} of 255 ({stops:.1f} stops)"
+    return f"means of {len(means)} photographs {span}{lost}"
 
 
 def _why_near(config: Config, capture: Capture) -> str:
@@ -279,20 +270,16 @@ COMFORTABLE = {"cpu": 1_000_000, "cuda": 4_000_000}
 
 def hints_of(state: TrainingState) -> list[str]:
     """Return the hints for a run at its start, or where it is resumed."""
-    capture, ranks = state.capture, state.ranks
+    capture, ranks, data = state.capture, state.ranks, state.config.data
+    factors = [factor for factor, _ in state.config.schedule.resolution]
     hints = [
         undistortion_note(capture),
-        sharing_hint(
-            capture,
-            state.config.data.cache_bytes,
-            ranks.local_world_size,
-            [factor for factor, _ in state.config.schedule.resolution],
-        ),
+        sharing_hint(capture, data.cache_bytes, ranks.local_world_size, factors),
     ]
     if state.config.model.exposure and state.stepper.exposures is None:
         hints.append("model.exposure: the photographs have the same exposure, so none is modelled")
     if state.progress.step == 0:  # a resumed run keeps its batches and images
-        hints.append(large_images_hint(capture, state.config.data.downscale, ranks.device.type))
+        hints.append(large_images_hint(capture, data.downscale, ranks.device.type))
         hints.append(small_batch_hint(state.schedule.batch_size, ranks.world_size))
     return [hint for hint in hints if hint is not None]
 
@@ -382,13 +369,11 @@ class Estimate:
     def __str__(self) -> str:
         most, kept = (f"{round(n, 2 - len(str(n))):,}" for n in (self.gaussians, self.kept))
         in_the_end = f" ({kept} in the end)" if self.kept < self.gaussians else ""
-        memory = f"{self.host_bytes / 1e9:.1f} GB of memory"
-        if self.device_bytes:
-            memory = f"{self.device_bytes / 1e9:.1f} GB on the GPU, {memory}"
-        minutes = max(1, round(self.minutes))
+        device = f"{self.device_bytes / 1e9:.1f} GB on the GPU, " if self.device_bytes else ""
         return (
-            f"about {most} Gaussians at most{in_the_end}, {memory} and {minutes:,} minutes for "
-            f"{self.images:,} images (rough: time within a factor of 3, memory of 2)"
+            f"about {most} Gaussians at most{in_the_end}, {device}{self.host_bytes / 1e9:.1f} GB of memory "
+            f"and {max(1, round(self.minutes)):,} minutes for {self.images:,} images (rough: time within a "
+            "factor of 3, memory of 2)"
         )
 
 

@@ -18,11 +18,9 @@ from blitzgs.view.levels import FOOTPRINT_LEVELS, footprint_levels, footprint_si
 
 
 def follow_schedule(state: TrainingState, begin: int) -> None:
-    """Open the LOD gate, if the step at [begin, begin + B) is the first that has it.
+    """Open the LOD gate, if the step at [begin, begin + B) is the first that has it. Collective.
 
     With `view.footprint`, levels follow opacities and scales (`Schedule.has_new_levels`).
-
-    Collective: every rank calls this before every step.
     """
     view = state.config.view
     # A Gaussian that is left out gathers no gradients for density control.
@@ -43,9 +41,8 @@ def follow_footprints(state: TrainingState) -> None:
     # In no training view is a Gaussian larger than at the largest focal length.
     focal = max(float(state.capture.cameras[index].K[0, 0]) for index in state.capture.train)
     sizes = footprint_sizes(table["scales"], table["opacities"])
-    table["level"] = footprint_levels(
-        sizes, focal / config.view.footprint, state.progress.reference_distance, level_fork(config)
-    )
+    distance, fork = state.progress.reference_distance, level_fork(config)
+    table["level"] = footprint_levels(sizes, focal / config.view.footprint, distance, fork)
     state.progress.level_count = FOOTPRINT_LEVELS
     state.stepper.reindex()
 
@@ -53,9 +50,8 @@ def follow_footprints(state: TrainingState) -> None:
 def choose_views(state: TrainingState) -> None:
     """If the LOD gate is open, choose the training views in which it leaves out enough to pay. Collective.
 
-    The choice holds until an importance pass prunes Gaussians. It is saved with
-    the checkpoints: a resumed run has other Gaussians than at the time of the choice, and might choose
-    other views.
+    The choice holds until an importance pass prunes Gaussians. It is saved with the checkpoints: a resumed
+    run has other Gaussians than at the time of the choice, and might choose other views.
     """
     if state.progress.finest_level is None:
         return

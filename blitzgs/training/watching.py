@@ -14,7 +14,7 @@ from blitzgs.training.events import save
 from blitzgs.training.state import TrainingState
 from blitzgs.util.errors import warn
 from blitzgs.view.draw import Drawer, DrawingError
-from blitzgs.view.look import Look, Picture, Watcher, Wish
+from blitzgs.view.look import Watcher, Wish
 
 # Seconds between two questions to the watcher while the training is paused and nothing is to be drawn.
 _PAUSE_SECONDS = 0.03
@@ -64,23 +64,19 @@ class Watching:
                 save.finish_checkpoint(self._state)
         if wish.look is None:
             return
-        begin, look = time.perf_counter(), wish.look
+        begin, state = time.perf_counter(), self._state
         try:
-            picture = self._drawn(look)
+            if isinstance(state.stepper.gaussians, Pool):
+                # The pool is filled for the view, and written back with nothing pending.
+                state.catch_up()
+            picture = Drawer(state.subject(), TileOwners(state.ranks)).draw(wish.look)
         except Exception as error:
-            if self._state.ranks.world_size > 1 and not isinstance(error, DrawingError):
+            if state.ranks.world_size > 1 and not isinstance(error, DrawingError):
                 raise  # the other ranks are in the middle of the picture
             self._asked("failed", str(error))
             return
         if picture is not None:
             self._asked("show", picture, time.perf_counter() - begin)
-
-    def _drawn(self, look: Look) -> Picture | None:
-        state = self._state
-        if isinstance(state.stepper.gaussians, Pool):
-            # The pool is filled for the view, and written back with nothing pending.
-            state.catch_up()
-        return Drawer(state.subject(), TileOwners(state.ranks)).draw(look)
 
     def _asked(self, method: str, *arguments: Any) -> Any:
         """Call a method of the watcher; None without one, or if it fails. After an error it is gone."""

@@ -424,8 +424,7 @@ def test_the_second_pass_follows_relocation(whole):
 
 def test_births_less_deaths_are_the_living(whole, tmp_path):
     pytest.importorskip("pyarrow")
-    from blitzgs.spawn.lineage import Cause
-    from blitzgs.spawn.lineage_parts import read_lineage
+    from blitzgs.spawn.lineage import Cause, read_lineage
 
     options, _, _ = whole
     train_on(Ranks(), tmp_path, "population.lineage=true", *options)

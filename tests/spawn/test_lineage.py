@@ -13,10 +13,17 @@ from hypothesis import strategies as st
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.population.density import DensityRules, densify
-from blitzgs.spawn import lineage_parts
 from blitzgs.spawn.candidates import FEATURES, spawn_features
-from blitzgs.spawn.lineage import Births, Cause, Ledger, Lineage, LineageError, initial_births
-from blitzgs.spawn.lineage_parts import PART_NAME, read_lineage
+from blitzgs.spawn.lineage import (
+    PART_NAME,
+    Births,
+    Cause,
+    Ledger,
+    Lineage,
+    LineageError,
+    initial_births,
+    read_lineage,
+)
 from blitzgs.table.placement import redistribute
 from tests.distributed.rank_harness import run_ranks
 from tests.helpers import refused
@@ -309,8 +316,7 @@ def test_a_full_disk_keeps_rows_and_sums_for_the_next_check(tmp_path, world_size
 
 
 @pytest.mark.cuda
-def test_rows_leave_the_gpu_without_keeping_the_host(tmp_path, monkeypatch):
-    monkeypatch.setattr(lineage_parts, "_STAGING_BYTES", 1000)
+def test_rows_leave_the_gpu_without_keeping_the_host(tmp_path):
     device = torch.device("cuda", torch.cuda.current_device())
     generator = torch.Generator().manual_seed(1)
     features = torch.randn(700, len(FEATURES), generator=generator)

@@ -31,8 +31,7 @@ from blitzgs.spawn.gate import (
     reasons_against,
     sampled_veto,
 )
-from blitzgs.spawn.lineage import ABOUT, Cause
-from blitzgs.spawn.lineage_parts import read_lineage
+from blitzgs.spawn.lineage import ABOUT, Cause, read_lineage
 from blitzgs.table.table import CULL
 from blitzgs.training.events import importance
 from blitzgs.util import progress

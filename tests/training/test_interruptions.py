@@ -18,7 +18,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.runs import checkpoint, trained_model
 from blitzgs.runs.folder import open_run
 from blitzgs.runs.guard import NonFiniteError
-from blitzgs.spawn.lineage_parts import read_lineage
+from blitzgs.spawn.lineage import read_lineage
 from blitzgs.training.agreement import MAX_STEPS, REPEAT_SECONDS, Agreement, SaveClock, StopRequest
 from blitzgs.training.events import save
 from tests.distributed.rank_harness import run_ranks

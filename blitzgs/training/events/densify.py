@@ -65,13 +65,10 @@ def run_density_event(state: TrainingState, event: Event) -> None:
 def _keep_sorted(state: TrainingState, event: Event, spread_now: int, is_sorted: bool) -> bool:
     """Sort the table if its blocks have become too large; no result depends on it. Every rank calls this.
 
-    After the last event the order stays for the rest of the run, so that sorting always pays.
-
-    `spread_now`: spread of the blocks of all ranks. `is_sorted`: whether the event has sorted the table
-    already. Returns whether this sorted the table.
+    After the last event the order stays for the rest of the run, so that sorting always pays. `is_sorted`:
+    whether the event has sorted the table already. Returns whether this did.
     """
-    sorts = not is_sorted
-    if sorts:
+    if not is_sorted:
         is_compact = spread_now <= MOST_SPREAD * state.progress.sorted_spread
         if is_compact and not state.schedule.is_last_density_event(event.time):
             return False
@@ -79,7 +76,7 @@ def _keep_sorted(state: TrainingState, event: Event, spread_now: int, is_sorted:
         state.stepper.reindex()
         _, spread_now = _over_all_ranks(state, {})
     state.progress.sorted_spread = spread_now
-    return sorts
+    return not is_sorted
 
 
 def _over_all_ranks(state: TrainingState, counts: dict[str, int]) -> tuple[dict[str, int], int]:

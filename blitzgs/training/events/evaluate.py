@@ -14,7 +14,7 @@ from blitzgs.capture.images import PhotographError
 from blitzgs.config.schedule import Event
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
-from blitzgs.runs.evaluation import EvaluationStoppedError, Lpips, evaluate, evenly_ordered, worst_views
+from blitzgs.runs.evaluation import EvaluationStoppedError, evaluate, evenly_ordered, worst_views
 from blitzgs.training.state import TrainingState
 from blitzgs.util.errors import warn
 from blitzgs.util.output import write_file
@@ -39,10 +39,8 @@ def evaluate_held_out(state: TrainingState, event: Event | None = None) -> dict[
             metrics = measure(state, capture.test or capture.train, folder)
             if event is None and capture.test:
                 cost = max(1e-9, (state.clock() - begin) / len(capture.test))
-                count = int(
-                    min(MOST_TRAINED, max(LEAST_TRAINED, TRAINED_SHARE * state.progress.seconds / cost))
-                )
-                count = state.ranks.broadcast_object(count)
+                affordable = max(LEAST_TRAINED, TRAINED_SHARE * state.progress.seconds / cost)
+                count = state.ranks.broadcast_object(int(min(MOST_TRAINED, affordable)))
                 _write_trained(state, evenly_ordered(capture.train)[:count], folder)
         except EvaluationStoppedError:
             text = "evaluation given up: the run has to stop"
@@ -73,9 +71,7 @@ def _write_trained(state: TrainingState, indices: Sequence[int], folder: Path) -
         warn(f"the metrics of training views are not written: {error}")
 
 
-def measure(
-    state: TrainingState, indices: Sequence[int], folder: Path | None, lpips: Lpips | None = None
-) -> dict[str, Any]:
+def measure(state: TrainingState, indices: Sequence[int], folder: Path | None) -> dict[str, Any]:
     """Compare the model with photographs; see `evaluate`. Without a folder nothing is written."""
     state.catch_up()
     with state.log.work("views measured") as report:
@@ -88,7 +84,6 @@ def measure(
             folder,
             TileOwners(state.ranks),
             pictures=PICTURES,
-            lpips=lpips,
             report=report,
             optional_files=True,
             stops=state.stops,

@@ -108,13 +108,11 @@ def _write(state: TrainingState, in_background: bool = False) -> Saving:
     state.stepper.write_back()
     if state.lineage is not None:
         try:
-            state.progress.ledger = asdict(
-                state.lineage.flush_and_check(state.table["id"], state.progress.step)
-            )
+            ledger = state.lineage.flush_and_check(state.table["id"], state.progress.step)
         except OSError as error:
-            raise CheckpointError(
-                f"no checkpoint was written, because {error}.", is_lack_of_space(error)
-            ) from error
+            text = f"no checkpoint was written, because {error}."
+            raise CheckpointError(text, is_lack_of_space(error)) from error
+        state.progress.ledger = asdict(ledger)
     saving = _save(state, state.folder, in_background)
     state.save_clock.restart()
     return saving
