@@ -68,18 +68,16 @@ class AdamSchedule(AdamTables):
     """
 
     def __init__(
-        self, lr_table: Tensor, beta1: float, beta2: float, eps: float, dtype: torch.dtype = torch.float32
+        self,
+        # float32 [S + 1, 6], learning rates of means, quats, scales, opacities, SH DC and SH rest for every
+        # step of the schedule (row 0 unused). It must not change afterwards.
+        lr_table: Tensor,
+        beta1: float,  # decay of the first moment, 0 <= beta1 < sqrt(beta2)
+        beta2: float,  # decay of the second moment, in (0, 1)
+        eps: float,  # as the attribute
+        dtype: torch.dtype = torch.float32,  # of the parameters
     ) -> None:
-        """Make the tables (ValueError: decay rates outside their range).
-
-        Args:
-            lr_table: float32 [S + 1, 6], learning rates of means, quats, scales, opacities, SH DC and SH rest
-                for every step of the schedule (row 0 unused). It must not change afterwards.
-            beta1: decay of the first moment, 0 <= beta1 < sqrt(beta2).
-            beta2: decay of the second moment, in (0, 1).
-            eps: as the attribute.
-            dtype: of the parameters.
-        """
+        """Make the tables (ValueError: decay rates outside their range)."""
         self.betas, self.eps = (beta1, beta2), eps
         self.explicit_steps = explicit_steps(beta1, beta2, dtype)
         self._take(_make_table(lr_table, beta1, beta2), lr_table, dtype)
@@ -136,21 +134,14 @@ class GrowingSchedule(AdamTables):
 
     def step_(
         self,
-        state: list[Tensor],
-        taken: Tensor,
-        gradient: Tensor,
-        rows: Tensor | None,
+        state: list[Tensor],  # of N rows
+        taken: Tensor,  # the number of steps taken, float32 [] on the CPU
+        gradient: Tensor,  # that of the rows, [U, ...]
+        rows: Tensor | None,  # int32 [U] or int64 [1, U], each once; None: all
+        # the learning rates of this step, for the first three values of a row and for the rest
         rates: tuple[float, float],
     ) -> None:
-        """Take the next step, as `lazy_adam_step_` does.
-
-        Args:
-            state: of N rows.
-            taken: the number of steps taken, float32 [] on the CPU.
-            gradient: that of the rows, [U, ...].
-            rows: int32 [U] or int64 [1, U], each once; None: all.
-            rates: the learning rates of this step, for the first three values of a row and for the rest.
-        """
+        """Take the next step, as `lazy_adam_step_` does."""
         constants = self.constants(self.row + 1)
         with below_autograd():
             torch.ops.blitzgs.lazy_adam_step_(
@@ -169,20 +160,17 @@ class GrowingSchedule(AdamTables):
 
 
 def lazy_adam_step_(
-    state: AdamState, schedule: AdamTables, step: int, grads: Sequence[Tensor], ids: Tensor | None
+    state: AdamState,  # of N rows; `last_step` and `moment_step` become `step` for `ids`
+    schedule: AdamTables,  # of S steps, for the dtype of the parameters
+    step: int,  # 1 <= step <= S
+    grads: Sequence[Tensor],  # gradients of the listed rows, shaped like the parameters with U rows
+    ids: Tensor | None,  # int32 or int64 [U], the rows, each once; None: all
 ) -> None:
     """Take Adam step ``step`` for the rows `ids`, in place, after the zero-gradient steps they skipped.
 
     Equals ``torch.optim.Adam`` (bias-corrected; Kingma & Ba 2015, Algorithm 1) over all rows, with zero
     gradients for the rows not listed, once `lazy_adam_catch_up_` has been called; see
     csrc/adam/lazy_adam.h for the closed form. All tensors on one device; float32 (CPU also float64).
-
-    Args:
-        state: of N rows; `last_step` and `moment_step` become `step` for `ids`.
-        schedule: of S steps, for the dtype of the parameters.
-        step: 1 <= step <= S.
-        grads: gradients of the listed rows, shaped like the parameters with U rows.
-        ids: int32 or int64 [U], the rows, each once; None: all.
     """
     with below_autograd():
         torch.ops.blitzgs.lazy_adam_step_(
@@ -191,20 +179,18 @@ def lazy_adam_step_(
 
 
 def lazy_adam_catch_up_(
-    state: AdamState, schedule: AdamTables, step: int, ids: Tensor | None = None, count: Tensor | None = None
+    state: AdamState,  # of N rows
+    schedule: AdamTables,  # of S steps, for the dtype of the parameters
+    step: int,  # 0 <= step <= S; 0: nothing to do
+    ids: Tensor | None = None,  # int32 or int64 [A], the rows, each once; None: all
+    # int32 [1], only the first `count` of `ids` are rows; the host does not wait for it. None: all.
+    count: Tensor | None = None,
 ) -> None:
     """Apply the missed zero-gradient steps up to ``step`` to the rows `ids` (None: all), in place.
 
     Only parameters and `last_step` change. Afterwards these parameters are those of dense Adam after
     ``step``. Rows that are current already do not change. The next step with a gradient applies the pending
     decay of the moments, beta^(step - moment_step).
-
-    Args:
-        state: of N rows.
-        schedule: of S steps, for the dtype of the parameters.
-        step: 0 <= step <= S; 0: nothing to do.
-        ids: int32 or int64 [A], the rows, each once; None: all.
-        count: int32 [1], only the first `count` of `ids` are rows; the host does not wait for it. None: all.
     """
     with below_autograd():
         torch.ops.blitzgs.lazy_adam_catch_up_(
@@ -219,14 +205,13 @@ def explicit_steps(beta1: float, beta2: float, dtype: torch.dtype) -> int:
     return 1 if ratio == 0 else max(1, math.ceil(math.log(negligible) / math.log(ratio)))
 
 
-def table_without_rates(steps: int, beta1: float, beta2: float, before: int = 0) -> Tensor:
+def table_without_rates(
+    steps: int,  # S + 1
+    beta1: float,  # decay of the first moment, 0 <= beta1 < sqrt(beta2)
+    beta2: float,  # decay of the second moment, in (0, 1)
+    before: int = 0,  # number of steps taken before the table begins; bias corrections count from there
+) -> Tensor:
     """Return `AdamSchedule.table` for learning rates of zero: only the columns that do not depend on them.
-
-    Args:
-        steps: S + 1.
-        beta1: decay of the first moment, 0 <= beta1 < sqrt(beta2).
-        beta2: decay of the second moment, in (0, 1).
-        before: number of steps taken before the table begins; bias corrections count from there.
 
     Returns:
         float64 [S + 1, 30] on the CPU.
@@ -269,14 +254,17 @@ def _make_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
 
 
 def project_bwd_step_(
+    # parameters before their activation, float32 or (CPU) float64, and their moments; `last_step` and
+    # `moment_step` become `step` for the visible Gaussians
     state: AdamState,
-    schedule: AdamSchedule,
-    step: int,
-    views: WeightedViews,
-    splats: ProjectedSplats,
+    schedule: AdamSchedule,  # of S steps, for the dtype of the parameters
+    step: int,  # 1 <= step <= S
+    views: WeightedViews,  # the views that the splats were projected into, and the weights of regularisers
+    splats: ProjectedSplats,  # the P splats that `project` returned for these parameters and views
+    # the options of the projection; scales and opacities are taken before their activation
     options: ProjectionOptions,
     gradients: SplatGradients,
-    level: Tensor | None = None,
+    level: Tensor | None = None,  # uint8 [N], octree levels, if opacities fade with them (`options.fade`)
 ) -> None:
     """Take Adam step ``step`` for the visible Gaussians, in place, with the gradients of their splats.
 
@@ -284,16 +272,6 @@ def project_bwd_step_(
     `blitzgs.ops.lazy_adam.lazy_adam_step_`, to rounding. On CUDA the gradients of the parameters are never
     stored. The parameters of the visible Gaussians must be at ``step`` - 1 (`lazy_adam_catch_up_`), as when
     they were projected.
-
-    Args:
-        state: parameters before their activation, float32 or (CPU) float64, and their moments; `last_step`
-            and `moment_step` become `step` for the visible Gaussians.
-        schedule: of S steps, for the dtype of the parameters.
-        step: 1 <= step <= S.
-        views: the views that the splats were projected into, and the weights of regularisers.
-        splats: the P splats that `project` returned for these parameters and views.
-        options: the options of the projection; scales and opacities are taken before their activation.
-        level: uint8 [N], octree levels, if opacities fade with them (`options.fade`).
     """
     with below_autograd():
         torch.ops.blitzgs.project_bwd_step_(

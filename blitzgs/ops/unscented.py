@@ -56,16 +56,15 @@ def largest_angles(radial: Tensor) -> Tensor:
     return angles.squeeze(-1).to(radial.dtype)
 
 
-def project_unscented(inputs: ProjectionInputs, lenses: Lenses) -> ProjectedSplats:
+def project_unscented(
+    inputs: ProjectionInputs,  # of the projection; `active`, `ids`, `level` and `options.fade` are not read
+    lenses: Lenses,  # of its views
+) -> ProjectedSplats:
     """Project Gaussians by the unscented transform (3DGUT, Wu et al. 2025; csrc/project/unscented.h).
 
     A Gaussian has a splat if some of its sigma points (all, if so asked) are valid, and else by the rules of
     `blitzgs.ops.project.project`. Differentiable, once, in the Gaussians; viewmats get no gradient.
     Every Gaussian is projected into every view, and the host waits for the number of splats.
-
-    Args:
-        inputs: of the projection; `active`, `ids`, `level` and `options.fade` are not read.
-        lenses: of its views.
 
     Returns:
         Splats as `blitzgs.ops.project.project` returns them.

@@ -67,17 +67,19 @@ class DensityReport:
 
 
 def densify(
-    table: GaussianTable,
+    table: GaussianTable,  # changed in place; the rows are those of `placement.place`
     rules: DensityRules,
     *,
-    time: int,
-    step: int,
+    time: int,  # time of the event, in images
+    step: int,  # the latest optimiser step; new rows are current up to it
     seed: int,
-    level_count: int,
-    ranks: Ranks,
+    level_count: int,  # number of octree levels K; levels of children stay below it
+    ranks: Ranks,  # the job, whose tables together are the population; every rank calls this
+    # extent of the scene, in the unit of the means; only used for the candidates' features
     extent: float = 1.0,
-    veto: Veto | None = None,
-    lineage: Lineage | None = None,
+    veto: Veto | None = None,  # returns which candidates are withheld; None: none are
+    lineage: Lineage | None = None,  # logs births and deaths, or None
+    # the table's pending steps, of which the candidates take theirs; None: there are none
     pending: Pending | None = None,
 ) -> DensityReport:
     """Run one density event, and reset the statistics that it used.
@@ -90,17 +92,6 @@ def densify(
     does not depend on the order of the rows.
 
     Pruning applies to old and new rows; a new row has no screen radius yet.
-
-    Args:
-        table: changed in place; the rows are those of `placement.place`.
-        time: time of the event, in images.
-        step: the latest optimiser step; new rows are current up to it.
-        level_count: number of octree levels K; levels of children stay below it.
-        ranks: the job, whose tables together are the population; every rank calls this.
-        extent: extent of the scene, in the unit of the means; only used for the candidates' features.
-        veto: returns which candidates are withheld; None: none are.
-        lineage: logs births and deaths, or None.
-        pending: the table's pending steps, of which the candidates take theirs; None: there are none.
     """
     gradient = table["grad_sum"] / table["grad_count"].clamp(min=1)
     candidates = (gradient >= rules.grad_threshold) & (table["grad_count"] >= rules.min_observations)

@@ -224,19 +224,19 @@ def _all_culled(n_views: int, device: torch.device) -> Tensor:
     return torch.from_numpy(words)[None].to(device)
 
 
-def sample_by_score(score: Tensor, ids: Tensor, keep: float, seed: int, event: int, ranks: Ranks) -> Tensor:
+def sample_by_score(
+    score: Tensor,  # float32 [N_rank], >= 0
+    ids: Tensor,  # int64 [N_rank], persistent
+    keep: float,  # share of all ranks' N Gaussians, in [0, 1]; its decimal value counts
+    seed: int,
+    event: int,  # number that differs between draws, such as the time of the pass
+    ranks: Ranks,  # the job; every rank calls this
+) -> Tensor:
     """Draw the Gaussians that pass 1 keeps: without replacement, with probability proportional to score.
 
     The Gaussians with the floor(keep N) smallest values of -log(u) / score are kept (exponential races,
     Efraimidis and Spirakis 2006), where u depends only on (seed, event, id). A Gaussian with score zero is
     kept only if all with positive scores are.
-
-    Args:
-        score: float32 [N_rank], >= 0.
-        ids: int64 [N_rank], persistent.
-        keep: share of all ranks' N Gaussians, in [0, 1]; its decimal value counts.
-        event: number that differs between draws, such as the time of the pass.
-        ranks: the job; every rank calls this.
 
     Returns:
         bool [N_rank], the same ids at every world size.
@@ -244,16 +244,16 @@ def sample_by_score(score: Tensor, ids: Tensor, keep: float, seed: int, event: i
     return smallest(sampling_keys(score, ids, seed, event), ids, _share_of_all(keep, score, ranks), ranks)
 
 
-def top_by_score(score: Tensor, ids: Tensor, mass: float, keep: float, ranks: Ranks) -> Tensor:
+def top_by_score(
+    score: Tensor,  # float32 [N_rank], finite, >= 0
+    ids: Tensor,  # int64 [N_rank], persistent; they decide between equal scores
+    # the prefix is the shortest that holds this share of the total score of all ranks, in [0, 1]
+    mass: float,
+    # the prefix has at most floor(keep N) of all ranks' N Gaussians; in [0, 1], its decimal value counts
+    keep: float,
+    ranks: Ranks,  # the job; every rank calls this
+) -> Tensor:
     """Choose the Gaussians that pass 2 keeps: a prefix of the order by descending score.
-
-    Args:
-        score: float32 [N_rank], finite, >= 0.
-        ids: int64 [N_rank], persistent; they decide between equal scores.
-        mass: the prefix is the shortest that holds this share of the total score of all ranks, in [0, 1].
-        keep: the prefix has at most floor(keep N) of all ranks' N Gaussians; in [0, 1], its decimal value
-            counts.
-        ranks: the job; every rank calls this.
 
     Returns:
         bool [N_rank], the same ids at every world size.

@@ -64,11 +64,14 @@ class FirstGaussians:
 
 
 def octree_gaussians(
-    points: Tensor,
-    colors: Tensor,
-    centres: Tensor,
-    levels: Levels,
+    points: Tensor,  # SfM points, float64 [M, 3], on any device
+    colors: Tensor,  # their colours, uint8 [M, 3]
+    centres: Tensor,  # camera centres, float64 [V, 3]
+    levels: Levels,  # from `measure_levels` on the same points and cameras
+    # a voxel is kept when its level is resolvable in more than this share of the cameras
     visible_threshold: float,
+    # largest number of Gaussians. Whole levels are kept, from the coarsest on, and of the first level that
+    # does not fit a random part. 0: no limit.
     most: int = 0,
     seed: int = 0,
 ) -> FirstGaussians:
@@ -79,16 +82,6 @@ def octree_gaussians(
 
     A Gaussian sits at its voxel's centre with the mean colour of the points inside and the mean distance of
     its 3 nearest neighbours as its size.
-
-    Args:
-        points: SfM points, float64 [M, 3], on any device.
-        colors: their colours, uint8 [M, 3].
-        centres: camera centres, float64 [V, 3].
-        levels: from `measure_levels` on the same points and cameras.
-        visible_threshold: a voxel is kept when its level is resolvable in more than this share of the
-            cameras.
-        most: largest number of Gaussians. Whole levels are kept, from the coarsest on, and of the first level
-            that does not fit a random part. 0: no limit.
 
     Raises:
         ValueError: no voxel is left.

@@ -38,17 +38,19 @@ from blitzgs.table.table import GaussianTable, opacity_logit
 
 @torch.no_grad()
 def relocate(
-    table: GaussianTable,
-    rules: DensityRules,
+    table: GaussianTable,  # changed in place; the rows are those of `placement.place`
+    rules: DensityRules,  # thresholds for dead Gaussians, and the limit of the population
     *,
-    growth: float,
-    time: int,
-    step: int,
+    growth: float,  # share of the population that the event adds
+    time: int,  # time of the event, in images
+    step: int,  # the latest optimiser step; new rows are current up to it
     seed: int,
-    ranks: Ranks,
+    ranks: Ranks,  # the job, whose tables together are the population; every rank calls this
+    # extent of the scene, in the unit of the means; only used for the lineage's features
     extent: float = 1.0,
-    level_count: int = 1,
-    lineage: Lineage | None = None,
+    level_count: int = 1,  # number of octree levels; only used for the lineage's features
+    lineage: Lineage | None = None,  # logs births and deaths, or None
+    # the table's pending steps, of which the copied Gaussians take theirs; None: there are none
     pending: Pending | None = None,
 ) -> DensityReport:
     """Replace dead Gaussians by copies of live ones, and let the population grow.
@@ -61,18 +63,6 @@ def relocate(
     (`share_rows_`), and the copies begin with moments of zero. Copies have the level, phi and cull row of the
     Gaussian that they copy, and no statistics. Draws and ids depend only on (seed, time, id), so the result
     depends neither on the order of the rows nor on the number of ranks.
-
-    Args:
-        table: changed in place; the rows are those of `placement.place`.
-        rules: thresholds for dead Gaussians, and the limit of the population.
-        growth: share of the population that the event adds.
-        time: time of the event, in images.
-        step: the latest optimiser step; new rows are current up to it.
-        ranks: the job, whose tables together are the population; every rank calls this.
-        extent: extent of the scene, in the unit of the means; only used for the lineage's features.
-        level_count: number of octree levels; only used for the lineage's features.
-        lineage: logs births and deaths, or None.
-        pending: the table's pending steps, of which the copied Gaussians take theirs; None: there are none.
 
     Returns:
         The report; `cloned` is the number of all copies on this rank, `relocated` that of the dead they
