@@ -129,9 +129,8 @@ def render_frame(
 ) -> Frame:
     """Render views of a table whose active rows have no pending optimiser steps.
 
-    Returns:
-        The frame; its images do not depend on the order of the table's rows, on inactive rows, or on how many
-        ranks shared the work.
+    Returns the frame; its images do not depend on the order of the table's rows, on inactive rows, or on how
+    many ranks shared the work.
     """
     transport = transport or open_transport(None if assignment is None else assignment.ranks)
     grid = tile_grid(views, options, assignment)
@@ -306,9 +305,8 @@ def survey(
 ) -> Survey:
     """Measure what each Gaussian contributes to views of a table without pending optimiser steps.
 
-    Returns:
-        The splats of this rank's Gaussians with the sums over the tiles of all ranks; the bits do not depend
-        on the number of ranks.
+    Returns the splats of this rank's Gaussians with the sums over the tiles of all ranks; the bits do not
+    depend on the number of ranks.
     """
     transport = transport or open_transport(None if assignment is None else assignment.ranks)
     inputs = inputs_of(table, views, options, active, colored=False)

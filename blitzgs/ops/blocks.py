@@ -109,10 +109,7 @@ def cull_blocks(
 
     The set is conservative: it contains every row that projection would project, however many of its pending
     steps have been applied by then. A row is dropped from a view only if it certainly misses that view
-    (csrc/active/blocks.h).
-
-    Raises:
-        RuntimeError: as `gate_views_`.
+    (csrc/active/blocks.h). RuntimeError: as `gate_views_`.
     """
     cameras = (views.viewmats, views.Ks, views.width, views.height)
     gate = () if rules is None else (level_ranges, *rules)
@@ -131,8 +128,7 @@ def gate_views_(
 ) -> None:
     """Clear the bits of `active.views` for the (row, view) pairs that B views leave out; no row is removed.
 
-    Raises:
-        RuntimeError: no level, finer levels that reach farther, or a column that the cull matrix lacks.
+    RuntimeError: no level, finer levels that reach farther, or a column that the cull matrix lacks.
     """
     level, reach, lod_views, cull, columns = rules
     with below_autograd():
@@ -157,9 +153,8 @@ def sectors_of_rows(
 ) -> Tensor:
     """Convert a mask from the layout by row to the layout by block and column (a column is a view).
 
-    Returns:
-        int32 [ceil(N / 256), 32 words, 8]: for each block of 256 rows and column the 32 bytes of the rows'
-        bits; bit r % 32 of word r / 32 is that of the block's row r. Rows beyond N have zeros.
+    Returns int32 [ceil(N / 256), 32 words, 8]: for each block of 256 rows and column the 32 bytes of the
+    rows' bits; bit r % 32 of word r / 32 is that of the block's row r. Rows beyond N have zeros.
     """
     return torch.ops.blitzgs.sectors_of_rows(rows)
 
@@ -206,10 +201,8 @@ def swap_blocks_(
     The contents of slot `slots[i]` are written to block `leaving[i]` of the table, and block `coming[i]` is
     read into the slot. One kernel does both at once, so that on CUDA it uses both directions of the bus. All
     slots must differ, and so must all leaving and coming blocks together; none of this is checked.
-
-    Raises:
-        RuntimeError: columns that differ in dtype or in the shape of a row, are not contiguous or too many,
-            or a table that is not in (pinned) memory of the host.
+    RuntimeError: columns that differ in dtype or in the shape of a row, are not contiguous or too many, or a
+    table that is not in (pinned) memory of the host.
     """
     torch.ops.blitzgs.swap_blocks_(list(pool), list(table), n_written, slots, leaving, coming)
 
@@ -223,10 +216,7 @@ def take_rows(
     """Return the rows `rows` of each column, as `column.index_select(0, rows)` does.
 
     For rows whose size is a multiple of 16 bytes, torch's op is slower, because it uses a whole block of
-    threads for each.
-
-    Returns:
-        [M, ...] of each column.
+    threads for each. Returns [M, ...] of each column.
     """
     if out is None:
         out = [column.new_empty((len(rows), *column.shape[1:])) for column in columns]

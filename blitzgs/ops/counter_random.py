@@ -56,10 +56,7 @@ def sampling_keys(
     """Draw keys; the k smallest are a sample without replacement, with probability proportional to weight.
 
     key = -log(u) / weight with u uniform in (0, 1) from (seed, event, id) alone (exponential races,
-    Efraimidis and Spirakis 2006).
-
-    Returns:
-        float32 [N].
+    Efraimidis and Spirakis 2006). Returns float32 [N].
     """
     return torch.ops.blitzgs.sampling_keys(weights, ids, seed, event)
 
@@ -73,8 +70,7 @@ def key_histogram(
 ) -> Tensor:
     """Count keys by a digit of their ordered bits: 32-bit integers with the order of the keys.
 
-    Returns:
-        int64 [2^width].
+    Returns int64 [2^width].
     """
     return torch.ops.blitzgs.key_histogram(keys, prefix, shift, width)
 

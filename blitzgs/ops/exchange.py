@@ -22,14 +22,10 @@ def scatter_splats(
 ) -> tuple[Tensor, Tensor]:
     """Copy each splat into the groups of the ranks that it is sent to.
 
-    Returns:
-        packed int32 [words]: one group after the other, in each the columns one after the other; and places
-        int64 [ceil(P / PLACE_SPLATS), M], where in each group the splats are: what
-        `SplatGradients.sum_returned` needs. The order of the splats of a run is kept; on CUDA that of runs is
-        not.
-
-    Raises:
-        RuntimeError: columns of different lengths, or too many.
+    Returns packed int32 [words]: one group after the other, in each the columns one after the other; and
+    places int64 [ceil(P / PLACE_SPLATS), M], where in each group the splats are: what
+    `SplatGradients.sum_returned` needs. The order of the splats of a run is kept; on CUDA that of runs is
+    not. RuntimeError: columns of different lengths, or too many.
     """
     return torch.ops.blitzgs.scatter_splats([words_of(c) for c in columns], masks, list(group_sizes))
 
@@ -41,11 +37,8 @@ def gather_splats(
 ) -> list[Tensor]:
     """Unpack groups that `scatter_splats` packed into columns.
 
-    Returns:
-        Columns [sum(group_sizes), ...] with the dtypes and splat shapes of `like`.
-
-    Raises:
-        RuntimeError: the number of words is not what `like` needs.
+    Returns columns [sum(group_sizes), ...] with the dtypes and splat shapes of `like`. RuntimeError: the
+    number of words is not what `like` needs.
     """
     widths = [words_per_splat(column) for column in like]
     parts = torch.ops.blitzgs.gather_splats(packed, widths, list(group_sizes))
@@ -84,8 +77,7 @@ def tile_costs(
 ) -> list[Tensor]:
     """Return the costs of the tiles of each view of a batch in the form in which they are stored.
 
-    Returns:
-        For each view float16 [ceil(T / grain)], at most 65504, in memory of its own.
+    Returns for each view float16 [ceil(T / grain)], at most 65504, in memory of its own.
     """
     return torch.ops.blitzgs.tile_costs(sums, first, views, grain)
 
@@ -102,10 +94,8 @@ def divide_tiles(
 ) -> tuple[int, ...]:
     """Cut the tiles of a batch, one view after the other, into contiguous ranges of nearly equal cost.
 
-    The bounds have the same bits on every host as long as the sum of all costs is below 2^33.
-
-    Returns:
-        M + 1 ascending bounds, 0 and B T included; each is the one nearest to its share of the total, the
-        later one of two.
+    The bounds have the same bits on every host as long as the sum of all costs is below 2^33. Returns M + 1
+    ascending bounds, 0 and B T included; each is the one nearest to its share of the total, the later one of
+    two.
     """
     return tuple(torch.ops.blitzgs.divide_tiles(costs, similar, tiles, grain, tile_cost, parts))

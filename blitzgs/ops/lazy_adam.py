@@ -213,11 +213,7 @@ def table_without_rates(
 ) -> Tensor:
     """Return `AdamSchedule.table` for learning rates of zero: only the columns that do not depend on them.
 
-    Returns:
-        float64 [S + 1, 30] on the CPU.
-
-    Raises:
-        ValueError: decay rates outside their range.
+    Returns float64 [S + 1, 30] on the CPU. ValueError: decay rates outside their range.
     """
     if not (beta1 >= 0 and 0 < beta2 < 1 and beta1 < math.sqrt(beta2)):
         raise ValueError(

@@ -23,9 +23,7 @@ def photometric_loss(
     """Return ``(1 - w) mean |x - y| + w (1 - mean SSIM)`` of each view; differentiable in `renders`.
 
     Means are over the unmasked pixels and the channels of a view; a view with no such pixel has loss 0.
-
-    Returns:
-        [B], dtype of `renders`.
+    Returns [B], dtype of `renders`.
     """
     l1, ssim_sums = photometric_sums(renders, targets, masks)
     counts = pixel_counts(renders, masks)
@@ -87,10 +85,9 @@ def photometric_fwd_bwd(
     For the loss of `photometric_loss`, summed over views: ``l1_weights = 1 - w``, ``ssim_weights = -w`` and
     ``samples = pixel_counts(renders, masks)``.
 
-    Returns:
-        (sums float64 [B, K, 2] in K parts, v_renders [B, H, W, 3], undefined beyond the owned pixels,
-        ``scale_weight / max(visible, 1)`` [B], ``opacity_weight / (B max(visible, 1))`` [B]; the last two
-        are [0] without `visible`, and zeros if the images have no pixels).
+    Returns (sums float64 [B, K, 2] in K parts, v_renders [B, H, W, 3], undefined beyond the owned pixels,
+    ``scale_weight / max(visible, 1)`` [B], ``opacity_weight / (B max(visible, 1))`` [B]; the last two are [0]
+    without `visible`, and zeros if the images have no pixels).
     """
     with below_autograd():
         return torch.ops.blitzgs.photometric_fwd_bwd(

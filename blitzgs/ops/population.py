@@ -118,10 +118,8 @@ def residual_draws(
     """Divide draws in proportion to weights: whole numbers for certain, and keys that draw the rest.
 
     Residual resampling (Liu and Chen 1998): row i gets floor(draws w_i / total) draws; those that are left go
-    to the rows with the smallest keys, which are `sampling_keys` of what the rows are short of.
-
-    Returns:
-        Whole draws, int64 [N], and keys, float32 [N].
+    to the rows with the smallest keys, which are `sampling_keys` of what the rows are short of. Returns whole
+    draws, int64 [N], and keys, float32 [N].
     """
     return torch.ops.blitzgs.residual_draws(weights, ids, draws, total, seed, event)
 
@@ -157,8 +155,7 @@ def tree_sums(
 ) -> Tensor:
     """Return, for each row of features, the sum of the leaf values that it reaches in all trees.
 
-    Returns:
-        int64 [M], the same bits on every device.
+    Returns int64 [M], the same bits on every device.
     """
     return torch.ops.blitzgs.tree_sums(features, roots, nodes, leaves, depth)
 
@@ -170,10 +167,8 @@ def voxel_keys(
 ) -> Tensor:
     """Return the voxel of each point: ``x | y << 21 | z << 42`` with ``floor((p - origin) / voxel_size)``.
 
-    Cells are clamped to [0, 2^21); equal keys mean the same voxel.
-
-    Returns:
-        int64 [N]; -1 for a point that is not finite.
+    Cells are clamped to [0, 2^21); equal keys mean the same voxel. Returns int64 [N]; -1 for a point that is
+    not finite.
     """
     corner = torch.tensor(origin, dtype=torch.float64, device=points.device)
     cells = ((points.double() - corner) / voxel_size).floor().clamp(0, (1 << CELL_BITS) - 1)

@@ -236,10 +236,7 @@ def sample_by_score(
 
     The Gaussians with the floor(keep N) smallest values of -log(u) / score are kept (exponential races,
     Efraimidis and Spirakis 2006), where u depends only on (seed, event, id). A Gaussian with score zero is
-    kept only if all with positive scores are.
-
-    Returns:
-        bool [N_rank], the same ids at every world size.
+    kept only if all with positive scores are. Returns bool [N_rank], the same ids at every world size.
     """
     return smallest(sampling_keys(score, ids, seed, event), ids, _share_of_all(keep, score, ranks), ranks)
 
@@ -255,8 +252,7 @@ def top_by_score(
 ) -> Tensor:
     """Choose the Gaussians that pass 2 keeps: a prefix of the order by descending score.
 
-    Returns:
-        bool [N_rank], the same ids at every world size.
+    Returns bool [N_rank], the same ids at every world size.
     """
     kept = mass_prefix(score, ids, mass, ranks)
     if keep < 1:

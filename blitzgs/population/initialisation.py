@@ -81,10 +81,7 @@ def octree_gaussians(
     (Kerbl et al. 2023).
 
     A Gaussian sits at its voxel's centre with the mean colour of the points inside and the mean distance of
-    its 3 nearest neighbours as its size.
-
-    Raises:
-        ValueError: no voxel is left.
+    its 3 nearest neighbours as its size. ValueError: no voxel is left.
     """
     # The lower corner of the grids: below all points, unless outliers overflow the finest grid.
     reach = levels.voxel_size_of(levels.count - 1) * 2 ** (CELL_BITS - 1)

@@ -62,11 +62,8 @@ def relocate(
     before (`shared_among_copies`). The copied Gaussian keeps its moments, scaled as its gradients are
     (`share_rows_`), and the copies begin with moments of zero. Copies have the level, phi and cull row of the
     Gaussian that they copy, and no statistics. Draws and ids depend only on (seed, time, id), so the result
-    depends neither on the order of the rows nor on the number of ranks.
-
-    Returns:
-        The report; `cloned` is the number of all copies on this rank, `relocated` that of the dead they
-        replace.
+    depends neither on the order of the rows nor on the number of ranks. Returns the report; `cloned` is the
+    number of all copies on this rank, `relocated` that of the dead they replace.
     """
     opacities = current(table, "opacities", pending)
     causes = death_causes(table, rules, opacities, pending)

@@ -101,7 +101,7 @@ def _cut(unclipped: Tensor, after: Tensor, before: Tensor, depths: Tensor, toler
 def median_splats(
     weights: Tensor,  # alpha T of M splats, front to back, [M, H, W], zero where a splat is not composited
 ) -> Tensor:
-    """Return the last splat composited with a transmittance above 0.5 in front of it, int64 [H, W]; -1: none."""
+    """Return the last splat composited with a transmittance above 0.5 in front, int64 [H, W]; -1: none."""
     before = 1 - (weights.cumsum(dim=0) - weights)
     numbers = torch.arange(len(weights))[:, None, None].expand_as(weights)
     return torch.where((weights > 0) & (before > 0.5), numbers, -1).amax(dim=0)

@@ -36,13 +36,9 @@ def new_file(
 ) -> Iterator[Path]:
     """Yield a temporary file to write; it gets its final name when the context ends without an error.
 
-    A reader of `path` sees the old file or the complete new one. Only a regular file is replaced.
-
-    Yields:
-        The temporary file, empty, in the same folder.
-
-    Raises:
-        OSError: `path` is a link, a device or a folder, or cannot be written; an existing file is unchanged.
+    A reader of `path` sees the old file or the complete new one. Only a regular file is replaced. Yields the
+    temporary file, empty, in the same folder. OSError: `path` is a link, a device or a folder, or cannot be
+    written; an existing file is unchanged.
     """
     check_replaceable(path)
     partial = path.with_name(f".{secrets.token_hex(6)}.partial")
