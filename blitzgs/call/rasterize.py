@@ -20,8 +20,8 @@ from blitzgs.call.arguments import (
 )
 from blitzgs.call.channels import ImageOptions, background_rows
 from blitzgs.call.extras import check_without_ut, checked_pixels, with_covariances, with_lenses, with_signals
-from blitzgs.call.images import render
 from blitzgs.call.ranks import gather_views
+from blitzgs.call.render import render
 from blitzgs.util.errors import explain_memory
 
 # Colours of networks under autocast, and of SH tables in half precision.
@@ -235,12 +235,12 @@ def rasterization(
     image = ImageOptions(
         render_mode, background, packed, sparse_grad, absgrad, return_normals, return_median, listed
     )
-    job = None
+    ranks = None
     if distributed:
         same = (width, height, projection.tile_size, render_mode, return_normals)
-        gaussians, job = gather_views(gaussians, absgrad, same)
+        gaussians, ranks = gather_views(gaussians, absgrad, same)
     try:
-        return render(gaussians, projection, image, job=job)
+        return render(gaussians, projection, image, ranks=ranks)
     except (RuntimeError, MemoryError) as error:
         explain_memory(error, gaussians.images, width, height, means.shape[-2], means.device)
         raise

@@ -26,9 +26,8 @@ from blitzgs.call.arguments import (
     gaussians_of,
 )
 from blitzgs.call.channels import ImageOptions, background_rows
-from blitzgs.call.groups import ShTables, gathered_groups, groups_may_be_queued, groups_of
-from blitzgs.call.images import render
 from blitzgs.call.rasterize import rasterization
+from blitzgs.call.render import ShTables, gathered_groups, groups_may_be_queued, groups_of, render
 from blitzgs.ops.derivatives import of_shape
 
 
@@ -164,7 +163,7 @@ def raw_rasterization(
     if groups_may_be_queued(groups):
         return render(gaussians, projection, image, tables=tables, groups=groups)
     # Several groups, no Gaussians, or another tile size: gather the Gaussians that any group sees.
-    groups = gathered_groups(groups, tables)
+    groups = gathered_groups(groups, tables, sparse_grad)
     return render(gaussians, projection, image, groups=groups)
 
 

@@ -121,6 +121,39 @@ def full_gradients(
     ]
 
 
+def rows_of_tables(
+    tables: Sequence[Tensor],  # [N, ...] each: four, and parts [N, L, 3] of the SH, if there are any
+    ids: Tensor,  # int64 [U], ascending, each once
+    sparse: bool,  # whether the gradients of the tables are sparse
+    found: Sequence[Tensor] | None = None,  # the result, if it is already known
+) -> tuple[Tensor, ...]:
+    """Return the rows `ids` of tables, [U, ...] each, with the parts of the SH joined to one.
+
+    The tables are not saved: their gradients do not depend on their values, which may change.
+    """
+    shapes, lengths = [table.shape for table in tables], [part.shape[1] for part in tables[4:]]
+
+    def gather(*tables: Tensor) -> tuple[Tensor, ...]:
+        if found is not None:
+            return tuple(found)
+        rows = [table.index_select(0, ids) for table in tables]
+        return (*rows[:4], *([torch.cat(rows[4:], dim=1)] if lengths else []))
+
+    def spread(_saved: Any, needed: Sequence[bool], v: Sequence[Tensor | None]) -> list[Tensor | None]:
+        gradients = list(v)
+        if len(lengths) > 1 and v[4] is not None:
+            # Autograd would copy a gradient that is not contiguous, and its indices with it. Torch adds to an
+            # empty sparse gradient in place, so parts share no memory.
+            parts = v[4].split_with_sizes(lengths, 1)
+            gradients[4:] = [part.clone(memory_format=torch.contiguous_format) for part in parts]
+        elif lengths:
+            gradients[4:] = [v[4]] * len(lengths)
+        wanted = [gradient if need else None for gradient, need in zip(gradients, needed, strict=True)]
+        return full_gradients(ids, wanted, shapes, [sparse] * len(shapes))
+
+    return linear_map(gather, spread, tables)
+
+
 def distinct_rows(table: Tensor) -> tuple[Tensor, Tensor]:
     """Return the rows int64 [1, U], each once, and the values [U, ...] of a sparse tensor.
 
