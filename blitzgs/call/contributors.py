@@ -54,29 +54,16 @@ def contributions(
         scales: [N, 3] standard deviations (after the exponential).
         opacities: [N] in [0, 1] (after the sigmoid).
         viewmats: [C, 4, 4] world to camera, a rotation and a translation; any number of views.
-        Ks: [C, 3, 3] intrinsics in px, without skew and with a last row 0, 0, 1.
-        width: of every view, px.
-        height: of every view, px.
-        near_plane: Gaussians have z > near_plane, world units.
-        far_plane: Gaussians have z <= far_plane, world units.
-        eps2d: variance added to both screen axes, px^2.
-        rasterize_mode: "classic" or "antialiased".
+        Ks: [C, 3, 3] intrinsics in px.
+        width, height, near_plane, far_plane, eps2d, rasterize_mode: as in `blitzgs.rasterization`.
 
     Returns:
         weights float64 [C, N]; pixels int64 [C, N]; visible bool [C, N]: in depth range, and the box around
         its alpha >= 1/255 overlaps the image (gsplat's radii > 0). A Gaussian may be visible in this sense
         and contribute to no pixel.
 
-    Warns:
-        RuntimeWarning: an argument has values that are NaN or infinite; the Gaussians or views that have them
-            contribute nothing.
-
-    Raises:
-        TypeError: an argument is not a tensor, or not the kind of number it should be; or the tensors are
-            neither float32 nor float64.
-        ValueError: an argument has a wrong shape or value, or another dtype or device than the others; the
-            message names it.
-        RuntimeError: float64 tensors are on a GPU, or the call is inside a transform of `torch.func`.
+    Warns, raises:
+        As `blitzgs.rasterization`; all arguments are looked at for values that are not finite.
     """
     options = checked_options(width, height, near_plane, far_plane, 0.0, eps2d, None, None, rasterize_mode)
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}

@@ -80,23 +80,11 @@ def raw_rasterization(
         opacities: [N] or [N, 1] logits.
         sh0: [N, 1, 3] or [N, 3], the first SH coefficient; or all of them, [N, K, 3], with shN None.
         shN: [N, K - 1, 3], the other SH coefficients.
-        viewmats: [C, 4, 4] world to camera, a rotation and a translation.
-        Ks: [C, 3, 3] intrinsics in px, without skew and with a last row 0, 0, 1. They get no gradient.
-            Others are refused; under `torch.compile` nothing is rendered with them.
-        width: image width in px.
-        height: image height in px.
-        near_plane: Gaussians have z > near_plane, world units; less than far_plane.
-        far_plane: Gaussians have z <= far_plane, world units.
-        radius_clip: drop splats whose radii in meta are both at most this, px, at least 0.
-        eps2d: variance added to both screen axes, px^2, at least 0.
+        viewmats, Ks, width, height, near_plane, far_plane, radius_clip, eps2d, tile_size, backgrounds,
+            render_mode, absgrad, rasterize_mode: as in `blitzgs.rasterization`, without batch dimensions.
         sh_degree: degree to evaluate, 0 to 3; None: the highest degree that the coefficients have.
-        tile_size: edge of a tile in px, 1 to 64; None: 16. The image is the same, on CUDA to rounding.
-        backgrounds: [C, D] behind everything; None for zero. Depth channels have none.
-        render_mode: "RGB", "D" (accumulated z), "ED" (expected z), "RGB+D" or "RGB+ED".
         sparse_grad: False: dense gradients, for parameters that are not leaves (`means + offsets`), and for
             optimisers, gradient clipping and torch's DistributedDataParallel, which take no others.
-        absgrad: as in `blitzgs.rasterization`.
-        rasterize_mode: "classic" or "antialiased".
         optimizers: the parameters' optimisers: one, a mapping or a sequence. Each `blitzgs.optim.LazyAdam`
             among them catches up the rows that this call reads: the geometry of all Gaussians, and the SH of
             the visible ones.
@@ -106,15 +94,9 @@ def raw_rasterization(
     Returns:
         As `blitzgs.rasterization(..., packed=True)`.
 
-    Warns:
-        RuntimeWarning: as `blitzgs.rasterization`.
-
-    Raises:
-        TypeError: an argument is not a tensor, or not the kind of number it should be, or gsplat has no such
-            argument; or the tensors are neither float32 nor float64; or `optimizers` are no optimisers.
-        ValueError: an argument is not supported, has a wrong shape or value, or another dtype or device than
-            the others; or a parameter is not a leaf, but would get a sparse gradient. The message names it.
-        RuntimeError: float64 tensors are on a GPU, or the call is inside a transform of `torch.func`.
+    Warns, raises:
+        As `blitzgs.rasterization`; also a TypeError if `optimizers` are no optimisers, and a ValueError if a
+        parameter is not a leaf, but would get a sparse gradient. The message names it.
     """
     if further:
         check_further("raw_rasterization", further, _defaults())
