@@ -132,16 +132,15 @@ def checked_options(
     far_plane: float,
     radius_clip: float,
     eps2d: float,
-    sh_degree: int | None,
-    tile_size: int | None,
+    sh_degree: int | None,  # None: 0
+    tile_size: int | None,  # None: 16
     rasterize_mode: str,
-    raw: bool = False,
+    raw: bool = False,  # whether scales and opacities are before their activation
 ) -> ProjectionOptions:
     """Check the arguments that are not tensors and return the projection's options.
 
-    `sh_degree`: None: 0. `tile_size`: None: 16. `raw`: whether scales and opacities are before their
-    activation. TypeError: a size or the degree is not a whole number, or another option not a number.
-    ValueError: one is out of range or has an unknown value.
+    TypeError: a size or the degree is not a whole number, or another option not a number. ValueError: one is
+    out of range or has an unknown value.
     """
     tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
     degree = 0 if sh_degree is None else sh_degree

@@ -103,6 +103,7 @@ def with_lenses(
     camera_model: str,
     rolling_shutter: Any,
     ut_params: Any,
+    # whether arguments that the unscented projection does not support are given, by what to call them
     refused: Mapping[str, bool],
     radial_coeffs: Tensor | None,
     tangential_coeffs: Tensor | None,
@@ -111,8 +112,7 @@ def with_lenses(
 ) -> Gaussians:
     """Return Gaussians whose scenes have lenses; the arguments are those of `blitzgs.rasterization`.
 
-    `refused`: whether arguments that the unscented projection does not support are given, by what to call
-    them. ValueError: one is, a shape or value is wrong, or two arguments do not go together.
+    ValueError: one is, a shape or value is wrong, or two arguments do not go together.
     """
     lead, first = gaussians.lead, gaussians.scenes[0].viewmats
     compiled = {"torch.compile": torch.compiler.is_compiling()}

@@ -127,18 +127,15 @@ for _class in (LazyDict, LateMapping):
 def make_meta(
     gaussians: Gaussians,
     layout: Layout,
-    others: Mapping[str, Tensor],
+    others: Mapping[str, Tensor],  # further images by key
     lists: Lists,
-    lead: tuple[int, ...],
+    lead: tuple[int, ...],  # batch dimensions, and the number of views that are rendered here
+    # the splats that `lists` refers to, if ranks have exchanged splats; None: those of `layout`
     arrived: ProjectedSplats | None,
 ) -> dict[str, Any]:
     """Return `meta`; entries that the image did not need are computed when they are first read.
 
     Under `torch.compile` it is a plain dict, and the compiler removes entries that the caller does not read.
-
-    `others`: further images by key. `lead`: batch dimensions, and the
-    number of views that are rendered here. `arrived`: the splats that `lists` refers to, if ranks have
-    exchanged splats; None: those of `layout`.
     """
     entries = _Entries(gaussians, layout, lists, lead, arrived)
     known = {

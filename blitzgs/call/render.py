@@ -74,16 +74,14 @@ def render(
     gaussians: Gaussians,
     projection: ProjectionOptions,
     image: ImageOptions,
+    # the SH, if only the rows of visible Gaussians are read; only where `groups_may_be_queued`
     tables: ShTables | None = None,
+    # those among which the Gaussians and views are divided; None: this process has all of them
     ranks: Ranks | None = None,
+    # `groups_of` the Gaussians, which have SH, if they are already known
     groups: Sequence[Group] | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Render images; return the results of `blitzgs.rasterization`.
-
-    `tables`: the SH, if only the rows of visible Gaussians are read; only where `groups_may_be_queued`.
-    `ranks`: those among which the Gaussians and views are divided; None: this process has all of them.
-    `groups`: `groups_of` the Gaussians, which have SH, if they are already known.
-    """
+    """Render images; return the results of `blitzgs.rasterization`."""
     compiling = torch.compiler.is_compiling()
     nan_marks: list[Tensor] = []
     if groups is None:
@@ -154,16 +152,13 @@ def _render_queued(
     inputs: ProjectionInputs,
     gaussians: Gaussians,
     image: ImageOptions,
-    only_colors: bool,
-    tables: ShTables | None,
+    only_colors: bool,  # whether the colours that the projection computes are all channels
+    tables: ShTables | None,  # the SH, if they are not part of `inputs`
 ) -> _Queued:
     """Render without gradients; the differentiable ops take this result instead of computing it again.
 
     If earlier calls had the same size, the host queues all work first and reads the number of splats while
     the GPU works.
-
-    `only_colors`: whether the colours that the projection computes are all channels. `tables`: the SH, if
-    they are not part of `inputs`.
     """
     options, means, signals = inputs.options, inputs.gaussians[0], gaussians.signals
     rows_of, sh = ((), ()) if tables is None else (inputs.gaussians, tables.parts)
@@ -216,18 +211,14 @@ def _transport(_device: torch.device, _gaussians: int, _views: int) -> LocalTran
 
 
 def _images_of_caller(
-    renders: Tensor,
-    alphas: Tensor,
-    median: Tensor | None,
+    renders: Tensor,  # all channels, [I, H, W, channels]
+    alphas: Tensor,  # [I, H, W]
+    median: Tensor | None,  # median depths, [I, H, W, 1] or of M pixels [M, 1]
     gaussians: Gaussians,
     image: ImageOptions,
-    lead: tuple[int, ...],
+    lead: tuple[int, ...],  # batch dimensions, and the number of views that are rendered here
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-    """Return images and alphas as the caller asked for them, and the further images of `meta` by key.
-
-    `renders`: all channels, [I, H, W, channels]. `alphas`: [I, H, W]. `median`: median depths, [I, H, W, 1]
-    or of M pixels [M, 1]. `lead`: batch dimensions, and the number of views that are rendered here.
-    """
+    """Return images and alphas as the caller asked for them, and the further images of `meta` by key."""
     alphas = alphas.unsqueeze(-1)
     if image.pixels is not None:
         renders, alphas = (t.flatten(0, 2).index_select(0, image.pixels.numbers) for t in (renders, alphas))

@@ -166,9 +166,11 @@ def rows_of_sectors(sectors: Tensor, n: int) -> Tensor:
 
 
 def seen_blocks(
-    bounds: Tensor,
-    viewmats: Tensor,
+    bounds: Tensor,  # from `update_block_bounds_`
+    viewmats: Tensor,  # `viewmats`, `Ks`: float32 [V, 4, 4] and [V, 3, 3]
     Ks: Tensor,
+    # int32 [V, 2], width and height of each of the V views, pixels. The others are the limits of
+    # `cull_blocks`.
     sizes: Tensor,
     near_plane: float,
     far_plane: float,
@@ -178,8 +180,6 @@ def seen_blocks(
 
     A block without the bit of a view has no row that `blitzgs.ops.blocks.cull_blocks` lists for that view.
 
-    `bounds`: from `update_block_bounds_`. `viewmats`, `Ks`: float32 [V, 4, 4] and [V, 3, 3]. `sizes`: int32
-    [V, 2], width and height of each of the V views, pixels. The others are the limits of `cull_blocks`.
     Returns int32 [blocks], bit v set when view v may see a part of the block.
     """
     return torch.ops.blitzgs.seen_blocks(bounds, viewmats, Ks, sizes, near_plane, far_plane, eps2d)

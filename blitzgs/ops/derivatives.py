@@ -56,11 +56,11 @@ def linear_map(
     forward: Callable[..., tuple[Tensor, ...]],
     adjoint: Adjoint,
     inputs: Sequence[Tensor | None],
-    saved: Sequence[Tensor] = (),
+    saved: Sequence[Tensor] = (),  # tensors without gradients for `adjoint`
 ) -> tuple[Tensor, ...]:
     """Apply a linear map to tensors, with the gradient that its adjoint gives.
 
-    Autograd records nothing of `forward`. `saved`: tensors without gradients for `adjoint`.
+    Autograd records nothing of `forward`.
     """
     outputs: tuple[Tensor, ...] = _LinearMap.apply(forward, adjoint, saved, *inputs)  # type: ignore[no-untyped-call]
     return outputs

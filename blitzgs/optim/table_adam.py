@@ -79,20 +79,17 @@ class TableAdam:
 
     def step(
         self,
+        # the one that was rendered, unchanged since; its visible rows must be current up to `step` - 1
         table: GaussianTable,
         frame: Frame,
-        gradients: SplatGradients,
+        gradients: SplatGradients,  # of the frame's splats, from `frame.backward_splats`
+        # `scale_reg`, `opacity_reg`: weights per view, [B], of the smallest axis and of the opacity of each
+        # Gaussian visible in it; None: no such term
         scale_reg: Tensor | None,
         opacity_reg: Tensor | None,
         step: int,
     ) -> None:
-        """Take step number `step` (from 1) for the Gaussians that a frame shows.
-
-        `table`: the one that was rendered, unchanged since; its visible rows must be current up to
-        `step` - 1. `gradients`: of the frame's splats, from `frame.backward_splats`. `scale_reg`,
-        `opacity_reg`: weights per view, [B], of the smallest axis and of the opacity of each Gaussian visible
-        in it; None: no such term.
-        """
+        """Take step number `step` (from 1) for the Gaussians that a frame shows."""
         project_bwd_step_(
             _state_of(table),
             self.schedule,

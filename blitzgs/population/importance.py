@@ -82,24 +82,21 @@ class Importance:
 
 
 def sweep(
-    gaussians: TableOrPool,
-    batches: Iterable[ViewBatch],
-    n_views: int,
+    gaussians: TableOrPool,  # this rank's, without pending optimiser steps
+    batches: Iterable[ViewBatch],  # the views, each once, in the same batches on every rank
+    n_views: int,  # V, columns of the cull matrix
     options: RenderOptions,
     ranks: Ranks,
-    owners: TileOwners | None = None,
-    rule: ScoreRule = "density",
+    owners: TileOwners | None = None,  # divides the tiles by their costs; the result does not depend on it
+    rule: ScoreRule = "density",  # of the score
+    # leaves Gaussians out of views as rendering does; there they contribute nothing and hide nothing
     lod: ModelGate | None = None,
+    # whether to give up, asked before each batch but the first; the same answer on every rank
     stops: Callable[[], bool] | None = None,
 ) -> Importance:
     """Score the Gaussians by their contributions to V views. Collective: every rank calls it.
 
-    `gaussians`: this rank's, without pending optimiser steps. `batches`: the views, each once, in the same
-    batches on every rank. `n_views`: V, columns of the cull matrix. `owners`: divides the tiles by their
-    costs; the result does not depend on it. `rule`: of the score. `lod`: leaves Gaussians out of views as
-    rendering does; there they contribute nothing and hide nothing. `stops`: whether to give up, asked before
-    each batch but the first; the same answer on every rank. SweepStoppedError: `stops` said so; the table is
-    as it was.
+    SweepStoppedError: `stops` said so; the table is as it was.
     """
     table = table_of(gaussians)
     sums = _Sums(len(table), n_views, table.device, rule)

@@ -37,16 +37,12 @@ class FirstGaussians:
 
     def table(
         self,
-        sh_degree: int,
-        opacity: float,
+        sh_degree: int,  # highest degree of the table
+        opacity: float,  # of all of them, in (0, 1)
         device: torch.device | str = "cpu",
-        part: slice = slice(None),  # noqa: B008  (a slice cannot be changed)
+        part: slice = slice(None),  # noqa: B008  (a slice cannot be changed)  # which of them the table gets
     ) -> GaussianTable:
-        """Make a table of them, without rotation; ids count from 0.
-
-        `sh_degree`: highest degree of the table. `opacity`: of all of them, in (0, 1). `part`: which of them
-        the table gets.
-        """
+        """Make a table of them, without rotation; ids count from 0."""
         means = self.means[part].to(device)
         sh = torch.zeros(len(means), (sh_degree + 1) ** 2, 3, device=device)
         sh[:, 0] = self.colors[part].to(device)
