@@ -49,16 +49,11 @@ class Space:
 
     The unit is the power of two for which the scene's extent is in [1, 2). Scaling by a power of two is
     exact, so a capture that is scaled by one trains to the same bits.
-
-    Attributes:
-        offset: origin of the trained world in the capture's coordinates.
-        unit: length of one trained unit in the capture's.
-        extent: extent of the scene, in trained units.
     """
 
-    offset: tuple[float, float, float]
-    unit: float
-    extent: float
+    offset: tuple[float, float, float]  # origin of the trained world in the capture's coordinates
+    unit: float  # length of one trained unit in the capture's
+    extent: float  # extent of the scene, in trained units
 
     @classmethod
     def of(cls, offset: npt.NDArray[np.float64], extent: float) -> Space:
