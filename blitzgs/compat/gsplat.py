@@ -55,28 +55,43 @@ class Strategy:
 
 @dataclass
 class DefaultStrategy(Strategy):
-    """Density control of 3DGS (Kerbl et al. 2023, section 5): clone, split, prune, reset opacities."""
+    """Density control of 3DGS (Kerbl et al. 2023, section 5): clone, split, prune, reset opacities.
 
-    prune_opa: float = 0.005  # Gaussians of lower opacity are pruned
-    # mean gradient of the projected mean, in half images, above which a Gaussian grows
+    Attributes:
+        prune_opa: Gaussians of lower opacity are pruned.
+        grow_grad2d: mean gradient of the projected mean, in half images, above which a Gaussian grows.
+        grow_scale3d: Gaussians up to this size are cloned, larger ones split; in units of `scene_scale`.
+        grow_scale2d: Gaussians of a larger radius are split; in units of the longer side of the image.
+        prune_scale3d: after the first reset, larger Gaussians are pruned; in units of `scene_scale`.
+        prune_scale2d: the same for the radius.
+        refine_scale2d_stop_iter: step from which radii do not count; 0: they never do.
+        refine_start_iter: refinement begins after this step.
+        refine_stop_iter: and ends at this one.
+        reset_every: steps between two resets of the opacities to at most twice `prune_opa`.
+        refine_every: steps between two refinements.
+        pause_refine_after_reset: steps without refinement after each reset.
+        absgrad: whether `info["means2d"].absgrad` counts (`rasterization(..., absgrad=True)`).
+        revised_opacity: whether the children of a split together are as opaque as their parent.
+        verbose: whether each refinement prints what it did.
+        key_for_gradient: the entry of `info` whose gradient counts.
+    """
+
+    prune_opa: float = 0.005
     grow_grad2d: float = 0.0002
-    # Gaussians up to this size are cloned, larger ones split; in units of `scene_scale`
     grow_scale3d: float = 0.01
-    # Gaussians of a larger radius are split; in units of the longer side of the image
     grow_scale2d: float = 0.05
-    # after the first reset, larger Gaussians are pruned; in units of `scene_scale`
     prune_scale3d: float = 0.1
-    prune_scale2d: float = 0.15  # the same for the radius
-    refine_scale2d_stop_iter: int = 0  # step from which radii do not count; 0: they never do
-    refine_start_iter: int = 500  # refinement begins after this step
-    refine_stop_iter: int = 15_000  # and ends at this one
-    reset_every: int = 3000  # steps between two resets of the opacities to at most twice `prune_opa`
-    refine_every: int = 100  # steps between two refinements
-    pause_refine_after_reset: int = 0  # steps without refinement after each reset
-    absgrad: bool = False  # whether `info["means2d"].absgrad` counts (`rasterization(..., absgrad=True)`)
-    revised_opacity: bool = False  # whether the children of a split together are as opaque as their parent
-    verbose: bool = False  # whether each refinement prints what it did
-    key_for_gradient: str = "means2d"  # the entry of `info` whose gradient counts
+    prune_scale2d: float = 0.15
+    refine_scale2d_stop_iter: int = 0
+    refine_start_iter: int = 500
+    refine_stop_iter: int = 15_000
+    reset_every: int = 3000
+    refine_every: int = 100
+    pause_refine_after_reset: int = 0
+    absgrad: bool = False
+    revised_opacity: bool = False
+    verbose: bool = False
+    key_for_gradient: str = "means2d"
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """Return the state; its tensors, [N] each, are made at the first step."""
@@ -218,19 +233,31 @@ class DefaultStrategy(Strategy):
 class MCMCStrategy(Strategy):
     """3DGS-MCMC (Kheradmand et al. 2024): dead Gaussians move to live ones, and positions get noise.
 
+    Attributes:
+        cap_max: number of Gaussians at which the population stops growing; relocation goes on.
+        noise_lr: the noise's strength is this times the learning rate of the means.
+        refine_start_iter: refinement begins after this step.
+        refine_stop_iter: and ends at this one.
+        noise_injection_stop_iter: step from which there is no noise; -1: there always is.
+        refine_every: steps between two refinements, each of which adds 5 %.
+        min_opacity: Gaussians up to this opacity are dead.
+        verbose: whether each refinement prints what it did.
+        noise_opacity_t: opacity at which the noise falls to a half.
+        noise_opacity_k: steepness of this fall.
+
     ValueError: `refine_every` is no number of steps.
     """
 
-    cap_max: int = 1_000_000  # number of Gaussians at which the population stops growing; relocation goes on
-    noise_lr: float = 5e5  # the noise's strength is this times the learning rate of the means
-    refine_start_iter: int = 500  # refinement begins after this step
-    refine_stop_iter: int = 25_000  # and ends at this one
-    noise_injection_stop_iter: int = -1  # step from which there is no noise; -1: there always is
-    refine_every: int = 100  # steps between two refinements, each of which adds 5 %
-    min_opacity: float = 0.005  # Gaussians up to this opacity are dead
-    verbose: bool = False  # whether each refinement prints what it did
-    noise_opacity_t: float = 0.005  # opacity at which the noise falls to a half
-    noise_opacity_k: float = _NOISE_STEEPNESS  # steepness of this fall
+    cap_max: int = 1_000_000
+    noise_lr: float = 5e5
+    refine_start_iter: int = 500
+    refine_stop_iter: int = 25_000
+    noise_injection_stop_iter: int = -1
+    refine_every: int = 100
+    min_opacity: float = 0.005
+    verbose: bool = False
+    noise_opacity_t: float = 0.005
+    noise_opacity_k: float = _NOISE_STEEPNESS
 
     def __post_init__(self) -> None:
         if self.refine_every != int(self.refine_every) or self.refine_every < 1:

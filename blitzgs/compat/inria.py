@@ -31,26 +31,39 @@ _UNIT_TOLERANCE = 1e-5
 
 
 class GaussianRasterizationSettings(NamedTuple):
-    """A view and how to render it; the fields of INRIA's class of this name, in its order."""
+    """A view and how to render it; the fields of INRIA's class of this name, in its order.
 
-    image_height: int  # px
-    image_width: int  # px
-    tanfovx: float  # tangent of half the horizontal field of view
-    tanfovy: float  # tangent of half the vertical field of view
-    bg: Tensor  # [C], the background
-    scale_modifier: float  # factor of the scales; `cov3D_precomp` ignores it
-    # [4, 4], world to camera for row vectors: the transpose of the usual matrix. A rotation and a
-    # translation.
+    Attributes:
+        image_height: px.
+        image_width: px.
+        tanfovx: tangent of half the horizontal field of view.
+        tanfovy: tangent of half the vertical field of view.
+        bg: [C], the background.
+        scale_modifier: factor of the scales; `cov3D_precomp` ignores it.
+        viewmatrix: [4, 4], world to camera for row vectors: the transpose of the usual matrix. A rotation and
+            a translation.
+        projmatrix: [4, 4], world to clip space for row vectors. Its principal point counts; its focal lengths
+            must be those of tanfovx and tanfovy.
+        sh_degree: degree to evaluate, 0 to 3.
+        campos: [3], the camera's centre; must fit `viewmatrix` if SH are rendered.
+        prefiltered: accepted, without effect.
+        debug: accepted, without effect.
+        antialiasing: whether opacities are compensated for the blur. None is the class without this field:
+            the rasteriser then returns no inverse depths.
+    """
+
+    image_height: int
+    image_width: int
+    tanfovx: float
+    tanfovy: float
+    bg: Tensor
+    scale_modifier: float
     viewmatrix: Tensor
-    # [4, 4], world to clip space for row vectors. Its principal point counts; its focal lengths must be those
-    # of tanfovx and tanfovy.
     projmatrix: Tensor
-    sh_degree: int  # degree to evaluate, 0 to 3
-    campos: Tensor  # [3], the camera's centre; must fit `viewmatrix` if SH are rendered
-    prefiltered: bool = False  # accepted, without effect
-    debug: bool = False  # accepted, without effect
-    # whether opacities are compensated for the blur. None is the class without this field: the rasteriser
-    # then returns no inverse depths.
+    sh_degree: int
+    campos: Tensor
+    prefiltered: bool = False
+    debug: bool = False
     antialiasing: bool | None = None
 
 
