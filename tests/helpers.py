@@ -22,7 +22,6 @@ from blitzgs.formats.gaussians import Gaussians
 from blitzgs.formats.models import FORMATS
 from blitzgs.frame.render import Frame, backward_splats
 from blitzgs.ops.photometric import report_
-from blitzgs.ops.projection_types import WeightedViews
 from blitzgs.reference import ReferenceImage, render
 from blitzgs.runs.checkpoint import Saving
 from blitzgs.runs.export import Exported, export
@@ -325,16 +324,20 @@ def read_glb(path):
 
 
 def parameter_gradients(
-    table: GaussianTable, frame: Frame, v_renders: Tensor, *weights: Tensor | None
+    table: GaussianTable,
+    frame: Frame,
+    v_renders: Tensor,
+    scale_reg: Tensor | None = None,
+    opacity_reg: Tensor | None = None,
 ) -> list[Tensor]:
     """Return the gradients of the U visible Gaussians' parameters, from those of a frame's images.
 
-    Training never stores them. `weights`: of regularisers, as those of `WeightedViews`.
+    Training never stores them. The weights are those of `project_bwd_step_`.
     """
     gradients, projected = backward_splats(frame, v_renders), frame.projected
     options = frame.options.projection(frame.views)
     *parameters, _ = torch.ops.blitzgs.project_bwd(
-        list(table.parameters), *WeightedViews(frame.views.viewmats, frame.views.Ks, *weights),
+        list(table.parameters), frame.views.viewmats, frame.views.Ks, scale_reg, opacity_reg,
         projected.camera_ids, projected.visible_ids, projected.splat_offsets, None, *options,
         list(gradients.parts), None, False,
     )  # fmt: skip

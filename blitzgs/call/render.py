@@ -171,8 +171,7 @@ def _render_queued(
 
     def attempt(capacity: Sizes | None) -> tuple[Exchange, list[Tensor]]:
         exchange = transport.project_and_send(inputs, None, capacity)
-        _, n_splats, n_isects = exchange.arrived
-        projected, has_spare = exchange.projected, n_splats is not None
+        projected, has_spare = exchange.projected, exchange.n_splats is not None
         splats = projected.splats
         if tables is not None:
             tables.before(splats.visible_ids, projected.n_visible if has_spare else None)
@@ -183,7 +182,7 @@ def _render_queued(
             splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids,
             splats.visible_ids, splats.splat_offsets, splats.radii, splats.tiles_touched,
             channels, image.render_mode != "RGB", rows_of, sh, *inputs.cameras, *options,
-            image.backgrounds, n_isects, backward_follows, projected.totals if has_spare else None,
+            image.backgrounds, exchange.n_isects, backward_follows, projected.totals if has_spare else None,
         )  # fmt: skip
         return exchange, outputs
 

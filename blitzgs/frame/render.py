@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -23,14 +23,13 @@ from blitzgs._library import below_autograd
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import open_transport
 from blitzgs.frame.transport.protocol import (
-    Arrived,
     Exchange,
     ExchangeResult,
     Transport,
     WayBack,
     stage_ended,
 )
-from blitzgs.ops.blocks import ActiveRows, GateRules
+from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.intersect import TileGrid
 from blitzgs.ops.projection_types import (
     ProjectedSplats,
@@ -77,17 +76,6 @@ class RenderOptions:
             antialiased=self.antialiased,
             fade=self.fade,
         )
-
-
-class ViewFilter(Protocol):
-    """What the views of a batch leave out before projection; frames and steps know no more of it."""
-
-    @property
-    def columns(self) -> Sequence[int]:
-        """The views' columns in the table's cull matrix; empty: no view has a mask."""
-
-    def rules(self, table: GaussianTable) -> GateRules:
-        """Return the rules for a table, as the ops take them."""
 
 
 class Frame(NamedTuple):
@@ -171,17 +159,18 @@ def _composite(
     exchange: Exchange, grid: TileGrid, backgrounds: Tensor | None, backward_follows: bool
 ) -> tuple[list[Tensor], Sequence[Tensor], Tensor | None]:
     """Return the tiles' lists, what `rasterize_fwd` returns, and zeros for the gradients of splats."""
-    splats, n_splats, _ = exchange.arrived
-    lists = tile_lists(exchange.arrived, grid)
+    splats, lists = exchange.arrived, tile_lists(exchange, grid)
     stage_ended("sort")
     geometry = (splats.means2d, splats.conics, splats.opacities)
     arguments = (*geometry, splats.colors, backgrounds, *lists, *grid)
     shared = exchange.gradient_table
     if shared is not None and backward_follows:
-        images = torch.ops.blitzgs.rasterize_fwd_(*arguments, shared, n_splats)
+        images = torch.ops.blitzgs.rasterize_fwd_(*arguments, shared, exchange.n_splats)
         zeros = shared
     else:
-        *images, zeros = torch.ops.blitzgs.rasterize_fwd(*arguments, False, backward_follows, n_splats)
+        *images, zeros = torch.ops.blitzgs.rasterize_fwd(
+            *arguments, False, backward_follows, exchange.n_splats
+        )
         if shared is not None:
             zeros = None  # the gradients must be in `shared`, which the backward pass then zeroes
     stage_ended("raster")
@@ -202,12 +191,12 @@ def inputs_of(
     return ProjectionInputs(gaussians, cameras, options.projection(views), active or (), table["id"], level)
 
 
-def tile_lists(arrived: Arrived, grid: TileGrid) -> list[Tensor]:
+def tile_lists(exchange: Exchange, grid: TileGrid) -> list[Tensor]:
     """Return the splats that each tile composites and where the list of each tile begins (op `intersect`)."""
-    splats, n_splats, n_isects = arrived
+    splats = exchange.arrived
     lists = torch.ops.blitzgs.intersect(
         splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, splats.ids,
-        *grid, n_isects, n_splats, True,
+        *grid, exchange.n_isects, exchange.n_splats, True,
     )  # fmt: skip
     return list(lists)
 
@@ -314,10 +303,9 @@ def survey(
 
     def attempt(capacity: Sizes | None) -> tuple[Exchange, tuple[Tensor, Tensor, Tensor]]:
         exchange = transport.project_and_send(inputs, assignment, capacity)
-        splats, n_splats, _ = exchange.arrived
-        lists = tile_lists(exchange.arrived, grid)
+        splats, lists = exchange.arrived, tile_lists(exchange, grid)
         geometry = (splats.means2d, splats.conics, splats.opacities)
-        return exchange, torch.ops.blitzgs.contributions(*geometry, *lists, *grid, n_splats, squares)
+        return exchange, torch.ops.blitzgs.contributions(*geometry, *lists, *grid, exchange.n_splats, squares)
 
     result, sums = run_attempts(transport, attempt)
     columns = [column[: len(result.splats.depths)] for column in (sums if squares else sums[:2])]

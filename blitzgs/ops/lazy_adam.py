@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from blitzgs._library import below_autograd
-from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions, WeightedViews
+from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
 from blitzgs.ops.splat_gradients import SplatGradients
 
 # Columns of the schedule's table, as in csrc/adam/lazy_adam.h: tails of 4 orders for 6 groups, powers of
@@ -54,18 +54,12 @@ class AdamTables:
 
 
 class AdamSchedule(AdamTables):
-    """The tables of a schedule whose learning rates are known in advance.
+    """The tables of a schedule whose learning rates are known in advance, made once for all steps."""
 
-    The tables are made once, so that a step computes none of this again.
-
-    Attributes:
-        lr_table: float32 [S + 1, 6], the learning rates of every step.
-        table: float64 [S + 1, 30] on the device of `lr_table`: for each step, the sums that give a row's
-            movement over the steps it misses after that one (csrc/adam/lazy_adam.h).
-        tables: `table`, `lr_table`, and the rules for rows that are `explicit_steps` or more steps behind. A
-            rule applies all missed steps of a row; rules are indexed by the row's last step: uint8
-            [max(0, S + 1 - explicit_steps), bytes], in a layout that only the ops read.
-    """
+    lr_table: Tensor  # float32 [S + 1, 6], the learning rates of every step
+    # float64 [S + 1, 30] on the device of `lr_table`: for each step, the sums that give a row's movement over
+    # the steps it misses after that one (csrc/adam/lazy_adam.h).
+    table: Tensor
 
     def __init__(
         self,
@@ -84,6 +78,8 @@ class AdamSchedule(AdamTables):
 
     def _take(self, table: Tensor, lr_table: Tensor, dtype: torch.dtype) -> None:
         self.table, self.lr_table, self._dtype = table, lr_table, dtype
+        # A rule applies all missed steps of a row that is `explicit_steps` or more behind; they are indexed by
+        # the row's last step: uint8 [max(0, S + 1 - explicit_steps), bytes], which only the ops read.
         rules = torch.ops.blitzgs.lazy_adam_final_rules(
             table, lr_table.new_empty(0, dtype=dtype), self.explicit_steps, self.eps
         )
@@ -138,8 +134,7 @@ class GrowingSchedule(AdamTables):
         taken: Tensor,  # the number of steps taken, float32 [] on the CPU
         gradient: Tensor,  # that of the rows, [U, ...]
         rows: Tensor | None,  # int32 [U] or int64 [1, U], each once; None: all
-        # the learning rates of this step, for the first three values of a row and for the rest
-        rates: tuple[float, float],
+        rates: tuple[float, float],  # of this step, for the first three values of a row and for the rest
     ) -> None:
         """Take the next step, as `lazy_adam_step_` does."""
         constants = self.constants(self.row + 1)
@@ -250,35 +245,26 @@ def _make_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
 
 
 def project_bwd_step_(
-    # parameters before their activation, float32 or (CPU) float64, and their moments; `last_step` and
-    # `moment_step` become `step` for the visible Gaussians
-    state: AdamState,
+    state: AdamState,  # parameters before their activation; float32 or (CPU) float64
     schedule: AdamSchedule,  # of S steps, for the dtype of the parameters
     step: int,  # 1 <= step <= S
-    views: WeightedViews,  # the views that the splats were projected into, and the weights of regularisers
+    # viewmats and Ks that the splats were projected into, and weights per view, [B], of the smallest axis and
+    # of the opacity of each Gaussian visible in it (before the compensation of antialiased splats); None: no
+    # such term
+    views: tuple[Tensor, Tensor, Tensor | None, Tensor | None],
     splats: ProjectedSplats,  # the P splats that `project` returned for these parameters and views
-    # the options of the projection; scales and opacities are taken before their activation
-    options: ProjectionOptions,
+    options: ProjectionOptions,  # of the projection; parameters are taken before their activation
     gradients: SplatGradients,
     level: Tensor | None = None,  # uint8 [N], octree levels, if opacities fade with them (`options.fade`)
 ) -> None:
     """Take Adam step ``step`` for the visible Gaussians, in place, with the gradients of their splats.
 
-    The result is that of the backward pass of `blitzgs.ops.project.project` followed by
-    `blitzgs.ops.lazy_adam.lazy_adam_step_`, to rounding. On CUDA the gradients of the parameters are never
-    stored. The parameters of the visible Gaussians must be at ``step`` - 1 (`lazy_adam_catch_up_`), as when
-    they were projected.
+    The result is that of the backward pass of `blitzgs.ops.project.project` followed by `lazy_adam_step_`, to
+    rounding. On CUDA the gradients of the parameters are never stored. The parameters of the visible
+    Gaussians must be at ``step`` - 1 (`lazy_adam_catch_up_`), as when they were projected.
     """
     with below_autograd():
         torch.ops.blitzgs.project_bwd_step_(
-            state.tensors,
-            [schedule.table, schedule.lr_table],
-            *schedule.constants(step),
-            *views,
-            splats.camera_ids,
-            splats.visible_ids,
-            splats.splat_offsets,
-            level,
-            *options,
-            gradients.parts,
-        )
+            state.tensors, [schedule.table, schedule.lr_table], *schedule.constants(step), *views,
+            splats.camera_ids, splats.visible_ids, splats.splat_offsets, level, *options, gradients.parts,
+        )  # fmt: skip

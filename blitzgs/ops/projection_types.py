@@ -123,17 +123,6 @@ class ProjectionOptions(NamedTuple):
 N_OPTIONS = len(ProjectionOptions._fields)
 
 
-class WeightedViews(NamedTuple):
-    """B views as the backward ops take them, in this order: cameras, and weights of regularisers."""
-
-    viewmats: Tensor  # [B, 4, 4], world to camera
-    Ks: Tensor  # [B, 3, 3], intrinsics in px
-    # Weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no such term.
-    scale_reg: Tensor | None = None
-    # The same of the opacity (without the compensation of antialiased splats).
-    opacity_reg: Tensor | None = None
-
-
 class ProjectionInputs(NamedTuple):
     """The inputs of a projection."""
 
@@ -167,16 +156,11 @@ class ProjectionInputs(NamedTuple):
         numbers. None: wait, and allocate exactly as many as there are. `rank_tiles`: for each rank the
         [begin, end) of the tiles that it composites, in ascending order.
         """
+        room = (None, None) if capacity is None else capacity[:2]
         *columns, splat_ids, totals = torch.ops.blitzgs.project_fwd(
-            self.gaussians,
-            *self.cameras,
-            *self.active_arguments,
-            self.ids,
-            self.level,
-            *self.options,
-            [tile for tiles in rank_tiles for tile in tiles],
-            *((None, None) if capacity is None else capacity[:2]),
-        )
+            self.gaussians, *self.cameras, *self.active_arguments, self.ids, self.level, *self.options,
+            [tile for tiles in rank_tiles for tile in tiles], *room,
+        )  # fmt: skip
         return ProjectionOutputs(ProjectedSplats._make((*columns, None)), splat_ids, totals)
 
 

@@ -13,7 +13,6 @@ from blitzgs.config.schedule import Schedule
 from blitzgs.frame.render import Frame
 from blitzgs.ops.blocks import put_rows_, take_rows
 from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_, project_bwd_step_
-from blitzgs.ops.projection_types import WeightedViews
 from blitzgs.ops.splat_gradients import SplatGradients
 from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 
@@ -90,16 +89,11 @@ class TableAdam:
         step: int,
     ) -> None:
         """Take step number `step` (from 1) for the Gaussians that a frame shows."""
+        views, options = frame.views, frame.options
         project_bwd_step_(
-            _state_of(table),
-            self.schedule,
-            step,
-            WeightedViews(frame.views.viewmats, frame.views.Ks, scale_reg, opacity_reg),
-            frame.projected,
-            frame.options.projection(frame.views),
-            gradients,
-            table["level"] if frame.options.fade else None,
-        )
+            _state_of(table), self.schedule, step, (views.viewmats, views.Ks, scale_reg, opacity_reg),
+            frame.projected, options.projection(views), gradients, table["level"] if options.fade else None,
+        )  # fmt: skip
 
 
 class Pending:

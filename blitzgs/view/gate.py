@@ -71,14 +71,14 @@ class LodGate:
 
 @dataclass(frozen=True)
 class ViewGate:
-    """LOD gate and cull mask of the views of one batch (`blitzgs.frame.render.ViewFilter`)."""
+    """LOD gate and cull mask of the views of one batch."""
 
     reach: Sequence[float]  # `LodGate.reach`
     lod_views: int  # bit v is set when view v has an LOD gate
     columns: Sequence[int] = ()  # the views' columns in the cull matrix; empty: no view has a mask
 
     def rules(self, table: GaussianTable) -> GateRules:
-        """See `blitzgs.frame.render.ViewFilter.rules`."""
+        """Return the rules for a table, as the ops take them."""
         mask = table.columns.get(CULL)
         sectors = None if mask is None else sectors_in(mask)
         return GateRules(table["level"], list(self.reach), self.lod_views, sectors, list(self.columns))

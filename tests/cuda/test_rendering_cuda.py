@@ -10,7 +10,7 @@ import blitzgs
 from blitzgs.frame.render import backward_splats, render_frame, tile_grid
 from blitzgs.frame.transport.protocol import CapacityEstimate, LocalTransport, stages_told_to
 from blitzgs.ops import project, splat_gradients
-from blitzgs.ops.projection_types import Sizes, WeightedViews
+from blitzgs.ops.projection_types import Sizes
 from blitzgs.ops.splat_gradients import gradient_columns
 from blitzgs.table.blocks import BlockIndex, morton_order
 from blitzgs.table.table import GaussianTable
@@ -171,7 +171,7 @@ def test_packed_gradients_equal_those_from_columns(degree):
     scale_reg = torch.linspace(0.1, 0.3, 3, device="cuda")
     projection = options.projection(views)
     *expected, _ = ops.project_bwd(
-        list(table.parameters), *WeightedViews(views.viewmats, views.Ks, scale_reg),
+        list(table.parameters), views.viewmats, views.Ks, scale_reg, None,
         projected.camera_ids, projected.visible_ids, projected.splat_offsets, None, *projection,
         unpacked, None, False,
     )  # fmt: skip

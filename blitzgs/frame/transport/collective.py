@@ -8,7 +8,6 @@ import torch.distributed as dist
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport.protocol import (
-    Arrived,
     CapacityEstimate,
     Exchange,
     ExchangeResult,
@@ -75,4 +74,4 @@ class CollectiveTransport:
             way_back = WayBack(ranks, traffic, places)
             result = ExchangeResult(own, splats, totals[ranks.rank], visible, way_back)
         stage_ended("exchange")
-        return Exchange(projected, Arrived(splats, None, traffic.n_isects), None, lambda: (needed, result))
+        return Exchange(projected, splats, None, traffic.n_isects, None, lambda: (needed, result))

@@ -49,7 +49,6 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import SharedMemory
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport.protocol import (
-    Arrived,
     CapacityEstimate,
     Exchange,
     ExchangeResult,
@@ -181,8 +180,8 @@ class PeerTransport:
 
         n_isects = Traffic.of(totals(), n_views, ranks.rank).n_isects if capacity is None else capacity.isects
         stage_ended("exchange")
-        arrived = Arrived(buffers.splats, plan[:1], n_isects)
-        return Exchange(projected, arrived, buffers.tables[ranks.rank], finish)
+        table = buffers.tables[ranks.rank]
+        return Exchange(projected, buffers.splats, plan[:1], n_isects, table, finish)
 
 
 @dataclass(frozen=True)

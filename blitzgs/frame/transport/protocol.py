@@ -6,7 +6,7 @@ that composite tiles which it touches, and its gradient is returned (BlitzGS, se
 frame, on every rank:
 
     exchange = transport.project_and_send(inputs, assignment, capacity)
-    exchange.arrived, exchange.gradient_table                # for compositing
+    exchange.arrived, exchange.gradient_table, ...           # for compositing
     needed, result = exchange.finish()                       # result None: the capacity was too small
     result.way_back.check_still_valid()                      # before the backward pass of compositing
     gradients = result.way_back.return_gradients(gradients)  # gradients of this rank's own splats
@@ -104,14 +104,6 @@ class Traffic(NamedTuple):
         return Sizes(self.most, self.most, self.most_isects, self.most_blocks)
 
 
-class Arrived(NamedTuple):
-    """The splats that this rank composites."""
-
-    splats: Splats  # the splats; the columns are longer than their number if the host does not know it yet
-    n_splats: Tensor | None  # int64 [1], number of valid splats, on the device; None: all are valid
-    n_isects: int  # upper bound of the tile entries, or capacity for them; -1: they must be counted
-
-
 class ExchangeResult(NamedTuple):
     """The splats after an exchange, cut to their numbers, which the host knows by now."""
 
@@ -126,7 +118,10 @@ class Exchange(NamedTuple):
     """The exchange of one frame's splats: queued work, whose sizes the host may not know until `finish`."""
 
     projected: ProjectionOutputs  # this rank's own splats, with spare capacity if the host does not know more
-    arrived: Arrived  # the splats that this rank composites
+    # The splats that this rank composites; longer than their number if the host does not know it yet.
+    arrived: Splats
+    n_splats: Tensor | None  # int64 [1], number of valid splats, on the device; None: all are valid
+    n_isects: int  # upper bound of the tile entries, or capacity for them; -1: they must be counted
     # Memory, [R, 12], in which the gradients of these splats must be added up, because other ranks read them
     # there; compositing must zero it. None: any memory can be used.
     gradient_table: Tensor | None
@@ -258,10 +253,8 @@ class LocalTransport:
         splats, copy = projected.for_compositing, HostCopy(projected.totals)
         stage_ended("project")
         known: list[int] = [] if capacity is not None else copy.read().tolist()
-        if capacity is None:
-            arrived = Arrived(splats, None, known[2])
-        else:
-            arrived = Arrived(splats, projected.n_splats, capacity.isects)
+        n_splats = None if capacity is None else projected.n_splats
+        n_isects = known[2] if capacity is None else capacity.isects
         stage_ended("exchange")
 
         def finish() -> tuple[Sizes, ExchangeResult | None]:
@@ -271,11 +264,11 @@ class LocalTransport:
             if capacity is None:
                 own, composited = projected.splats._replace(counts=counts), splats
             elif capacity.holds(needed):
-                valid = projected.first(needed, counts)
-                own, composited = valid.splats, valid.for_compositing
+                cut = projected.first(needed, counts)
+                own, composited = cut.splats, cut.for_compositing
             else:
                 return needed, None  # the splats are undefined
             visible = projected.totals[VIEW_TOTALS:]
             return needed, ExchangeResult(own, composited, totals, visible, None)
 
-        return Exchange(projected, arrived, None, finish)
+        return Exchange(projected, splats, n_splats, n_isects, None, finish)
