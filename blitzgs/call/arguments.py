@@ -107,10 +107,9 @@ class Gaussians(NamedTuple):
 def check_further(
     function: str, further: Mapping[str, Any], defaults: Mapping[str, Any] = GSPLAT_DEFAULTS
 ) -> None:
-    """Check further keyword arguments: only gsplat's names with gsplat's default values are accepted.
+    """Check further keyword arguments: only the names of `defaults` with their values are accepted.
 
-    `function`: name of the public function. `defaults`: the names and the only values that the function
-    takes. TypeError: gsplat has no such argument. ValueError: the value is not gsplat's default.
+    TypeError: gsplat has no such argument. ValueError: the value is not gsplat's default.
     """
     for name, value in further.items():
         if name not in defaults:
@@ -137,11 +136,7 @@ def checked_options(
     rasterize_mode: str,
     raw: bool = False,  # whether scales and opacities are before their activation
 ) -> ProjectionOptions:
-    """Check the arguments that are not tensors and return the projection's options.
-
-    TypeError: a size or the degree is not a whole number, or another option not a number. ValueError: one is
-    out of range or has an unknown value.
-    """
+    """Check the arguments that are not tensors (TypeError, ValueError); return the projection's options."""
     tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
     degree = 0 if sh_degree is None else sh_degree
     whole = {"width": width, "height": height, "tile_size": tile_size, "sh_degree": degree}
@@ -187,12 +182,11 @@ def refuse_func_transforms() -> None:
 
 
 def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]) -> None:
-    """Check that arguments are tensors on one device, all float32 or all float64.
+    """Check that arguments are tensors on one device, all float32 or all float64; optional ones may be None.
 
-    `optional`: further arguments by name, which may be None. RuntimeError: the call is inside a transform of
-    `torch.func`. TypeError: an argument is not a tensor, but for example an array of another library, or has
-    a dtype that the kernels do not compute in. ValueError: an argument has another dtype, or is on another
-    device, whose memory the kernels could not read.
+    RuntimeError: the call is inside a transform of `torch.func`. TypeError: an argument is no tensor, but
+    perhaps an array of another library, or has a dtype that the kernels lack. ValueError: dtypes or devices
+    differ.
     """
     refuse_func_transforms()
     device, dtype, first = None, None, ""

@@ -26,11 +26,9 @@ _LEAST_SKEW = 1e-6
 
 
 def check_intrinsics(Ks: Sequence[Tensor]) -> None:
-    """Refuse intrinsics that the pinhole projection does not have; waits for the device.
+    """Refuse intrinsics [C, 3, 3] of scenes with a skew, or another last row than 0, 0, 1 (ValueError).
 
-    The projection renders nothing with them, so that calls look only where a view shows nothing.
-
-    `Ks`: [C, 3, 3] of each scene. ValueError: a matrix has a skew, or another last row than 0, 0, 1.
+    The projection renders nothing with them, so calls look only where a view shows nothing: the host waits.
     """
     _check_rows(np.concatenate([to_host(matrices.detach()).numpy().reshape(-1, 9) for matrices in Ks]))
 
@@ -78,10 +76,8 @@ SIGNALS = "extra_signals"
 def non_finite(gaussians: Gaussians) -> dict[str, Tensor]:
     """Return, by argument, the indices int64 [M] of Gaussians or views whose values are not finite.
 
-    Indices count through all scenes of a batch. Arguments whose values are all finite have no entry.
-
-    One sum over each argument tells whether its rows have to be looked at, so finite arguments are read once
-    and need no memory of their size.
+    Indices count through all scenes of a batch. Arguments whose values are all finite have no entry: one sum
+    over each tells whether its rows have to be looked at, which needs no memory of their size.
     """
     activated = {
         name: [_activated(t, name, gaussians.raw) for t in tensors]

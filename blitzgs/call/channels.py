@@ -31,11 +31,7 @@ class ImageOptions(NamedTuple):
 def background_rows(
     backgrounds: Tensor | None, gaussians: Gaussians, render_mode: str, normals: bool = False
 ) -> Tensor | None:
-    """Return the background of each image, [I, channels], from `backgrounds`, [..., C, D] or [..., C, D + E].
-
-    `backgrounds`: of the colours and, as in gsplat, of the E extra signals if there are any. ValueError: the
-    shape does not fit.
-    """
+    """Return the background of each image, [I, channels], from [..., C, D] or [..., C, D + E]."""
     if backgrounds is None or "RGB" not in render_mode:
         return None
     assert gaussians.colors is not None

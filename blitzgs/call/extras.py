@@ -27,11 +27,7 @@ _UT_PARAMS = ("alpha", "beta", "kappa", "in_image_margin_factor", "require_all_s
 
 
 def with_signals(gaussians: Gaussians, values: Tensor, sh_degree: int | None) -> Gaussians:
-    """Return Gaussians with extra signals.
-
-    `values`: `extra_signals` of `blitzgs.rasterization`. `sh_degree`: its `extra_signals_sh_degree`.
-    ValueError: a shape, the degree or the number of channels does not fit.
-    """
+    """Return Gaussians with extra signals (ValueError: a shape, degree or width does not fit)."""
     batch, views, count = gaussians.lead[:-1], gaussians.views, gaussians.n_gaussians
     shape, per_view = tuple(values.shape), False
     most = MAX_CHANNELS - NORMAL_CHANNELS - 1
@@ -64,11 +60,7 @@ def with_signals(gaussians: Gaussians, values: Tensor, sh_degree: int | None) ->
 def with_covariances(
     gaussians: Gaussians, covars: Tensor, sparse_grad: bool, return_normals: bool
 ) -> Gaussians:
-    """Return Gaussians whose quats and scales are those of covariances.
-
-    `gaussians`: with any quats and scales. `covars` and the switches: as for `blitzgs.rasterization`.
-    ValueError: the shape does not fit, or a switch is on.
-    """
+    """Return Gaussians with axes of covariances (ValueError: wrong shape, or a switch is on)."""
     if sparse_grad:
         raise ValueError("sparse_grad does not support covars; leave one of them out")
     if return_normals:
@@ -87,10 +79,7 @@ def with_covariances(
 
 
 def check_without_ut(camera_model: str, rolling_shutter: Any, others: Mapping[str, object]) -> None:
-    """Check a call without with_ut: it has none of the arguments that need it.
-
-    ValueError: it has one, by name.
-    """
+    """Refuse arguments that need `with_ut` in a call without it (ValueError: the first one, by name)."""
     given = [name for name, value in others.items() if value is not None]
     given += ["rolling_shutter"] if _shutter(rolling_shutter) != GLOBAL_SHUTTER else []
     given += [f"camera_model={camera_model!r}"] if camera_model != "pinhole" else []
@@ -176,11 +165,10 @@ class Pixels(NamedTuple):
 def checked_pixels(
     pixels: Tensor | None, image_ids: Tensor | None, images: int, width: int, height: int
 ) -> Pixels | None:
-    """Check a list of pixels; None: there is none.
+    """Check `pixels` and `image_ids` of `blitzgs.rasterization`; None: there are none.
 
-    `pixels`: integers [M, 2], (row, column). `image_ids`: integers [M], the image of each pixel, counted
-    through all batch dimensions; None: 0. TypeError: they are not tensors of integers. ValueError: a shape
-    does not fit, a pixel is outside the images, or there are several images and no `image_ids`.
+    TypeError: they are not tensors of integers. ValueError: a shape does not fit, a pixel is outside the
+    images, or there are several images and no `image_ids`.
     """
     if pixels is None:
         if image_ids is not None:

@@ -36,11 +36,7 @@ class LazyDict(dict[str, Any]):
     """
 
     def __init__(self, given: Mapping[str, Any], compute: Callable[[str], Any]) -> None:
-        """Begin with some values.
-
-        `given`: the values by key; `LATER` where they are not known. `compute`: returns the value of such a
-        key.
-        """
+        """Begin with values by key; `LATER` for one that `compute` returns, given the key."""
         super().__init__(given)
         self._compute = compute
 

@@ -69,11 +69,7 @@ class TileOwners:
         self._planned: dict[int, tuple[int, ...]] = {}
 
     def plan(self, step: int, keys: Sequence[Hashable], width: int, height: int, halo: int) -> TileRanges:
-        """Divide the tiles of the batch of a later step, as `divide` does, and store the division.
-
-        `step`: step of the batch; its division is stored until `forget_before`. `keys`: identifies each of
-        the B views. `halo`: see `TileRanges`.
-        """
+        """Divide the tiles of a later step as `divide` does; keep the division until `forget_before`."""
         if step in self._planned:
             ranges = TileRanges(self._planned[step], len(keys), width, height, halo=halo)
             # The resolution of the step may have changed since, with the pace of the run.
@@ -131,11 +127,7 @@ class TileOwners:
     def divide(
         self, keys: Sequence[Hashable], width: int, height: int, tile_size: int = 16, halo: int = 0
     ) -> TileRanges:
-        """Divide the tiles of a batch.
-
-        `keys`: identifies each of the B views. `halo`: see `TileRanges`. Returns ranges whose costs differ
-        from equal shares by at most the cost of one tile.
-        """
+        """Divide the tiles of B views, named by keys, into ranges of equal cost to within one tile."""
         tiles = math.prod(tile_counts(width, height, tile_size))
         found = [self._costs.get(key) for key in keys]
         costs = [_UNKNOWN if cost is None or cost.tiles != tiles else cost.pieces for cost in found]

@@ -71,10 +71,7 @@ class TileRanges:
         return pixels_of_tiles(self.n_views, self.width, self.height, self.tile_size, *self.of(rank), device)
 
     def pixel_rows(self, rank: int) -> list[tuple[int, int]]:
-        """Return the rows [y0, y1) of each view's image that the loss of a rank's tiles reads.
-
-        (0, 0) for a view of which the rank owns no tile.
-        """
+        """Return the rows [y0, y1) of each view that the loss of a rank reads; (0, 0) without tiles."""
         (begin, end), tiles_x, tiles_per_view = self.of(rank), self.tiles_x, self.tiles_per_view
         rows = []
         for first in range(0, self.n_views * tiles_per_view, tiles_per_view):

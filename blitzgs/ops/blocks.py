@@ -167,20 +167,16 @@ def rows_of_sectors(sectors: Tensor, n: int) -> Tensor:
 
 def seen_blocks(
     bounds: Tensor,  # from `update_block_bounds_`
-    viewmats: Tensor,  # `viewmats`, `Ks`: float32 [V, 4, 4] and [V, 3, 3]
-    Ks: Tensor,
-    # int32 [V, 2], width and height of each of the V views, pixels. The others are the limits of
-    # `cull_blocks`.
-    sizes: Tensor,
-    near_plane: float,
+    viewmats: Tensor,  # float32 [V, 4, 4]
+    Ks: Tensor,  # float32 [V, 3, 3]
+    sizes: Tensor,  # int32 [V, 2], width and height of each view, pixels
+    near_plane: float,  # this and the next two as in `cull_blocks`
     far_plane: float,
     eps2d: float = 0.3,
 ) -> Tensor:
-    """Return the views that may see a part of each block.
+    """Return the views that may see a part of each block, int32 [blocks]: bit v is set if view v may.
 
-    A block without the bit of a view has no row that `blitzgs.ops.blocks.cull_blocks` lists for that view.
-
-    Returns int32 [blocks], bit v set when view v may see a part of the block.
+    A block without the bit of a view has no row that `cull_blocks` lists for that view.
     """
     return torch.ops.blitzgs.seen_blocks(bounds, viewmats, Ks, sizes, near_plane, far_plane, eps2d)
 

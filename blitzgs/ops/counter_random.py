@@ -68,10 +68,7 @@ def key_histogram(
     shift: int,  # number of bits after the digit
     width: int,  # number of bits of the digit, 1 to 11
 ) -> Tensor:
-    """Count keys by a digit of their ordered bits: 32-bit integers with the order of the keys.
-
-    Returns int64 [2^width].
-    """
+    """Count keys by a digit of their bits, taken as integers in the order of the keys; int64 [2^width]."""
     return torch.ops.blitzgs.key_histogram(keys, prefix, shift, width)
 
 

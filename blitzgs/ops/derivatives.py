@@ -58,10 +58,7 @@ def linear_map(
     inputs: Sequence[Tensor | None],
     saved: Sequence[Tensor] = (),  # tensors without gradients for `adjoint`
 ) -> tuple[Tensor, ...]:
-    """Apply a linear map to tensors, with the gradient that its adjoint gives.
-
-    Autograd records nothing of `forward`.
-    """
+    """Apply a linear map, of which autograd records nothing, with the gradient that its adjoint gives."""
     outputs: tuple[Tensor, ...] = _LinearMap.apply(forward, adjoint, saved, *inputs)  # type: ignore[no-untyped-call]
     return outputs
 
@@ -88,11 +85,7 @@ class _LinearMap(torch.autograd.Function):
 
 
 def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
-    """Return a sparse tensor of a table in which only the given rows are not zero.
-
-    `ids`: int32 or int64 [U], ascending, each once. `values`: the rows, [U, ...]. `shape`: shape of the
-    table.
-    """
+    """Return a sparse table of which only the rows `ids`, [U], ascending, each once, are not zero."""
     indices = ids.long()[None]
     if indices.shape[1] == 0:
         # Torch adds to an empty gradient in place, and would change the indices of all that share them.
@@ -155,20 +148,14 @@ def rows_of_tables(
 
 
 def distinct_rows(table: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the rows int64 [1, U], each once, and the values [U, ...] of a sparse tensor.
-
-    `table`: a tensor whose only sparse dimension is the first.
-    """
+    """Return rows int64 [1, U], each once, and values [U, ...] of a tensor with one sparse dimension."""
     if not table.is_coalesced():
         table = table.coalesce()
     return raw_indices(table), raw_values(table)
 
 
 def of_shape(table: Tensor, shape: Sequence[int]) -> Tensor:
-    """Return a table with rows of another shape and as many values, whose gradient may be sparse.
-
-    `table`: [N, ...]. `shape`: (N, ...).
-    """
+    """Return a table [N, ...] with rows of another shape, (N, ...), whose gradient may be sparse."""
 
     def back(_saved: Any, _needed: Any, v: Sequence[Tensor | None]) -> list[Tensor | None]:
         if v[0] is None or not v[0].is_sparse:

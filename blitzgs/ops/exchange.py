@@ -35,11 +35,7 @@ def gather_splats(
     like: Sequence[Tensor],  # the columns that were scattered, or others of their dtypes and splat shapes
     group_sizes: Sequence[int],  # splats of each group
 ) -> list[Tensor]:
-    """Unpack groups that `scatter_splats` packed into columns.
-
-    Returns columns [sum(group_sizes), ...] with the dtypes and splat shapes of `like`. RuntimeError: the
-    number of words is not what `like` needs.
-    """
+    """Unpack groups to columns [sum(group_sizes), ...] (RuntimeError: `like` needs other words)."""
     widths = [words_per_splat(column) for column in like]
     parts = torch.ops.blitzgs.gather_splats(packed, widths, list(group_sizes))
     return [
@@ -75,10 +71,7 @@ def tile_costs(
     views: int,  # B
     grain: int,  # over how many tiles a stored cost averages
 ) -> list[Tensor]:
-    """Return the costs of the tiles of each view of a batch in the form in which they are stored.
-
-    Returns for each view float16 [ceil(T / grain)], at most 65504, in memory of its own.
-    """
+    """Return the costs of each view's tiles as they are stored: float16 [ceil(T / grain)], at most 65504."""
     return torch.ops.blitzgs.tile_costs(sums, first, views, grain)
 
 

@@ -78,8 +78,8 @@ class AdamSchedule(AdamTables):
 
     def _take(self, table: Tensor, lr_table: Tensor, dtype: torch.dtype) -> None:
         self.table, self.lr_table, self._dtype = table, lr_table, dtype
-        # A rule applies all missed steps of a row that is `explicit_steps` or more behind; they are indexed by
-        # the row's last step: uint8 [max(0, S + 1 - explicit_steps), bytes], which only the ops read.
+        # A rule applies all missed steps of a row `explicit_steps` or more behind; rules are indexed by
+        # its last step: uint8 [max(0, S + 1 - explicit_steps), bytes], which only the ops read.
         rules = torch.ops.blitzgs.lazy_adam_final_rules(
             table, lr_table.new_empty(0, dtype=dtype), self.explicit_steps, self.eps
         )
@@ -109,10 +109,7 @@ class GrowingSchedule(AdamTables):
     def __init__(
         self, betas: tuple[float, float], eps: float, dtype: torch.dtype, device: torch.device, begin: int
     ) -> None:
-        """Begin with empty tables; the arguments are the attributes, and dtype and device of the parameter.
-
-        ValueError: decay rates outside their range.
-        """
+        """Begin with empty tables for such a parameter (ValueError: decay rates outside their range)."""
         self.betas, self.eps = betas, eps
         self.explicit_steps = explicit_steps(*betas, dtype)
         self.begin = self.last = self.current = begin
@@ -206,10 +203,7 @@ def table_without_rates(
     beta2: float,  # decay of the second moment, in (0, 1)
     before: int = 0,  # number of steps taken before the table begins; bias corrections count from there
 ) -> Tensor:
-    """Return `AdamSchedule.table` for learning rates of zero: only the columns that do not depend on them.
-
-    Returns float64 [S + 1, 30] on the CPU. ValueError: decay rates outside their range.
-    """
+    """Return `AdamSchedule.table` for rates of zero, on the CPU (ValueError: decay rates out of range)."""
     if not (beta1 >= 0 and 0 < beta2 < 1 and beta1 < math.sqrt(beta2)):
         raise ValueError(
             f"Adam's decay rates must satisfy 0 <= beta1 < sqrt(beta2) < 1, got beta1={beta1}, beta2={beta2}"

@@ -48,10 +48,7 @@ def pixel_counts(renders: Tensor, masks: Tensor | None = None) -> Tensor:
 
 
 def photometric_sums(renders: Tensor, targets: Tensor, masks: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Return the sums of |x - y| and of the SSIM map of each view, [B] each, dtype of `renders`.
-
-    Sums are over the unmasked pixels and the channels. Arguments and errors are those of `photometric_loss`.
-    """
+    """Return the sums of |x - y| and of the SSIM map of each view, [B] each, as for `photometric_loss`."""
     return torch.ops.blitzgs.photometric_fwd(renders, targets, _as_bytes(masks), 16, 0, -1)
 
 

@@ -153,10 +153,7 @@ def tree_sums(
     leaves: Tensor,  # int64 [n]; read at leaves
     depth: int,  # largest number of comparisons on a path from a root to a leaf
 ) -> Tensor:
-    """Return, for each row of features, the sum of the leaf values that it reaches in all trees.
-
-    Returns int64 [M], the same bits on every device.
-    """
+    """Return the sum of the leaves that each row reaches in all trees, int64 [M], the same everywhere."""
     return torch.ops.blitzgs.tree_sums(features, roots, nodes, leaves, depth)
 
 

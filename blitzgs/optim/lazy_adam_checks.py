@@ -15,11 +15,7 @@ Groups = Mapping[str, dict[str, Any]]  # parameter groups of one parameter each,
 
 
 def check_group(group: dict[str, Any]) -> None:
-    """Check the parameters and options of a group.
-
-    ValueError: a parameter has no rows, or an option is outside its range, or is one of `torch.optim.Adam`
-    that is not supported.
-    """
+    """Check the parameters and options of a group (ValueError: one is wrong or not supported)."""
     if any(isinstance(param, Tensor) and param.dim() == 0 for param in group["params"]):
         raise ValueError("LazyAdam: a parameter must have rows, [N, ...], got a single number; use Adam")
     beta1, beta2 = group["betas"]
@@ -34,10 +30,7 @@ def check_group(group: dict[str, Any]) -> None:
 
 
 def check_param(param: Tensor) -> None:
-    """Check that a parameter has a form that the op takes.
-
-    ValueError: it has another dtype, or is not contiguous.
-    """
+    """Check that a parameter has a form that the op takes (ValueError: it has not)."""
     if param.dtype not in (torch.float32, torch.float64):
         raise ValueError(
             f"LazyAdam: parameters must be float32 or float64, one of shape {list(param.shape)} is "
@@ -64,10 +57,7 @@ def check_chosen(params: Sequence[Tensor]) -> None:
 
 
 def check_listed(rows: Tensor, count: Tensor | None, param: Tensor) -> None:
-    """Check the rows that `catch_up` takes, on the CPU (on CUDA, the host would wait for them).
-
-    TypeError, ValueError: as `LazyAdam.catch_up`.
-    """
+    """Check the rows that `catch_up` takes, on the CPU (on CUDA, the host would wait for them)."""
     _check_tensor("catch_up: rows", rows)
     if rows.is_cpu:
         listed = rows if count is None else rows[: int(count)]
@@ -78,11 +68,7 @@ def check_listed(rows: Tensor, count: Tensor | None, param: Tensor) -> None:
 
 
 def check_saved(saved: Mapping[str, Any], params: Sequence[Tensor]) -> None:
-    """Check the state that `load_state_dict` takes.
-
-    `params`: all parameters; `torch.optim.Optimizer` checks their number. ValueError: as
-    `LazyAdam.load_state_dict`.
-    """
+    """Check the state that `load_state_dict` takes, of all parameters; torch checks their number."""
     for group in saved["param_groups"]:
         if missing := {"lr", "betas", "eps"} - group.keys():
             raise ValueError(
@@ -117,10 +103,7 @@ def groups_by_name(groups: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]
 
 
 def check_new_rows(rows: Mapping[str, Tensor], named: Groups) -> int:
-    """Check the rows that `append` takes; return their number.
-
-    TypeError, ValueError: as `LazyAdam.append`.
-    """
+    """Check the rows that `append` takes; return their number."""
     if rows.keys() != named.keys():
         raise ValueError(f"LazyAdam.append: rows for {sorted(named)} are needed, got {sorted(rows)}")
     for name, group in named.items():
@@ -136,7 +119,7 @@ def check_new_rows(rows: Mapping[str, Tensor], named: Groups) -> int:
 
 
 def check_mask(mask: Tensor, named: Groups) -> None:
-    """Check the mask that `keep` takes (TypeError, ValueError: as `LazyAdam.keep`)."""
+    """Check the mask that `keep` takes."""
     _check_tensor("keep: mask", mask)
     if mask.dtype != torch.bool:
         raise ValueError(f"LazyAdam.keep: mask must be bool, got {mask.dtype}")
@@ -151,7 +134,7 @@ def check_mask(mask: Tensor, named: Groups) -> None:
 
 
 def check_order(order: Tensor, named: Groups) -> None:
-    """Check the order that `permute` takes (TypeError, ValueError: as `LazyAdam.permute`)."""
+    """Check the order that `permute` takes."""
     _check_tensor("permute: order", order)
     if order.dtype != torch.int64 or order.dim() != 1:
         raise ValueError(

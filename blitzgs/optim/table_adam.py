@@ -60,10 +60,7 @@ class TableAdam:
     def catch_up(
         self, table: GaussianTable, ids: Tensor | None, step: int, count: Tensor | None = None
     ) -> None:
-        """Apply the pending steps up to `step` to the rows `ids` (int32 or int64 [A]; None: all).
-
-        ``count``, int32 [1]: only the first `count` of `ids` are rows.
-        """
+        """Apply the pending steps up to `step` to rows, int32 or int64 [A], or the first `count` of them."""
         lazy_adam_catch_up_(_state_of(table), self.schedule, step, ids, count)
 
     def pending(self, table: GaussianTable, step: int) -> Pending:

@@ -247,10 +247,7 @@ def top_by_score(
     keep: float,
     ranks: Ranks,  # the job; every rank calls this
 ) -> Tensor:
-    """Choose the Gaussians that pass 2 keeps: a prefix of the order by descending score.
-
-    Returns bool [N_rank], the same ids at every world size.
-    """
+    """Choose what pass 2 keeps, bool [N_rank], the same ids at any world size: the best by score."""
     kept = mass_prefix(score, ids, mass, ranks)
     if keep < 1:
         kept &= smallest(-score, ids, _share_of_all(keep, score, ranks), ranks)

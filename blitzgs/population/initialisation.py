@@ -40,7 +40,7 @@ class FirstGaussians:
         sh_degree: int,  # highest degree of the table
         opacity: float,  # of all of them, in (0, 1)
         device: torch.device | str = "cpu",
-        part: slice = slice(None),  # noqa: B008  (a slice cannot be changed)  # which of them the table gets
+        part: slice = slice(None),  # noqa: B008  (which of them the table gets)
     ) -> GaussianTable:
         """Make a table of them, without rotation; ids count from 0."""
         means = self.means[part].to(device)

@@ -166,10 +166,7 @@ class PositionNoise:
     seed: int
 
     def add(self, table: GaussianTable, visible_ids: Tensor, step: int, position_rate: float) -> None:
-        """Add noise to the means of rows `visible_ids` (int32 [U]), which are current up to `step`.
-
-        `position_rate` is the step's learning rate of the means, in their unit.
-        """
+        """Add noise to the means of rows, int32 [U], current up to `step`; the rate is that of the means."""
         position_noise_(
             table["means"],
             table["quats"],

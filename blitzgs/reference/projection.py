@@ -143,10 +143,7 @@ def _visible(parameters: list[Tensor], viewmat: Tensor, near: float, far: float)
 
 
 def _clamped_jacobian(x: Tensor, y: Tensor, z: Tensor, K: Tensor, width: int, height: int) -> Tensor:
-    """Return d(pixel)/d(camera point) [M, 2, 3] with the slopes held within 0.15 images of the borders.
-
-    For a centred principal point that is 1.3 tan(fov / 2).
-    """
+    """Return d(pixel)/d(camera point) [M, 2, 3], slopes held within 0.15 images of the borders."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     u = torch.clamp(x / z, (-0.15 * width - cx) / fx, (1.15 * width - cx) / fx)
     v = torch.clamp(y / z, (-0.15 * height - cy) / fy, (1.15 * height - cy) / fy)

@@ -90,11 +90,7 @@ class BlockIndex:
     """
 
     def __init__(self, table: GaussianTable, pending_table: Tensor | None = None) -> None:
-        """Compute the bounds of every block of the table.
-
-        `pending_table`: `AdamSchedule.table` of the lazy optimiser, if rows may have pending steps; None:
-        they have none.
-        """
+        """Compute all bounds; `pending_table` is `AdamSchedule.table`, if rows may have pending steps."""
         self._pending_table = pending_table
         count = -(-len(table) // BLOCK_ROWS)
         # The bounds of each block, float32 [blocks, 8]; see `update_block_bounds_` for their layout.

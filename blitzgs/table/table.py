@@ -183,10 +183,7 @@ class GaussianTable:
 
     @classmethod
     def of_parameters(cls, columns: Mapping[str, Tensor]) -> GaussianTable:
-        """Build a table for rendering only: the columns of the optimiser are zeros that take no memory.
-
-        `columns`: `PARAMETERS`, and "level" and "id" if known.
-        """
+        """Build a table for rendering from `PARAMETERS`, "level" and "id"; other columns take no memory."""
         sh = columns["sh"]
         count, known = len(sh), dict(columns)
         if "id" not in known:
@@ -371,10 +368,7 @@ class GaussianTable:
                 self.columns[name] = column[: placement.total]
 
     def move_rows(self, destination_ranks: Tensor, ranks: Ranks) -> None:
-        """Move every row to a rank. Collective: every rank calls it. Rows arrive ordered by source rank.
-
-        `destination_ranks`: int64 [N], the rank each row goes to.
-        """
+        """Move each row to a rank, int64 [N]. Collective. Rows arrive ordered by source rank."""
         order = torch.argsort(destination_ranks, stable=True)
         counts = torch.bincount(destination_ranks, minlength=ranks.world_size)
         sent = counts.tolist()

@@ -187,10 +187,7 @@ class Drawer:
 
 
 def _reserve(gaussians: TableOrPool, look: Look, device: torch.device) -> None:
-    """Allocate the memory of a frame, which torch keeps for it: without, one rank would fail in its middle.
-
-    RuntimeError: it cannot.
-    """
+    """Allocate the memory of a frame, which torch keeps for it: or one rank would fail in its middle."""
     if device.type == "cuda":
         rows = len(gaussians.held if isinstance(gaussians, Pool) else gaussians)
         size = rows * _ROW_BYTES + look.width * look.height * _PIXEL_BYTES

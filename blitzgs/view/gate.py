@@ -48,20 +48,15 @@ class LodGate:
         return kept + [-1.0] * (self.count - len(kept))
 
     def fade(self) -> tuple[float, ...]:
-        """Return the numbers by which the projection fades opacities; empty: they do not fade.
+        """Return f / (f - 1), then `reach`, by which the projection fades opacities; empty: they do not fade.
 
         Let r be the reach of a Gaussian's level and d its distance from the camera. Its opacity is multiplied
         by clamp((1 - d^2 / r^2) f / (f - 1), 0, 1), which is 1 up to r / sqrt(f) and 0 from r on.
-
-        Returns f / (f - 1), then `reach`.
         """
         return (self.fork / (self.fork - 1), *self.reach()) if self.smooth else ()
 
     def weights(self, means: Tensor, level: Tensor, centre: Tensor) -> Tensor:
-        """Return the factors of `fade` for the opacities of Gaussians in one view, float64 [N].
-
-        `means`: [N, 3]. `level`: uint8 [N]. `centre`: position of the camera, float64 [3].
-        """
+        """Return the factors of `fade` of means [N, 3] with levels [N], from a camera [3]; float64 [N]."""
         slope, *reach = self.fade()
         reaches = torch.tensor(reach, dtype=torch.float64, device=means.device)
         reaches = reaches[level.long().clamp(max=self.count - 1)]
@@ -119,10 +114,7 @@ class ModelGate:
         return other
 
     def kept(self, centres: Tensor) -> list[float]:
-        """Predict the share of all Gaussians that each view keeps. Collective.
-
-        `centres`: positions of the cameras, float64 [V, 3].
-        """
+        """Predict the share of Gaussians that views from positions float64 [V, 3] keep. Collective."""
         counts = torch.zeros(len(centres), dtype=torch.int64, device=self._means.device)
         length = max(1, _MAX_DISTANCES // max(1, len(self._means)))
         for begin in range(0, len(centres), length):
@@ -149,10 +141,7 @@ class ModelGate:
         return active
 
     def rows(self, means: Tensor, level: Tensor, viewmat: Tensor) -> Tensor:
-        """Return which Gaussians a view keeps, bool [N]; only for a single process.
-
-        `means`: float32 [N, 3]. `level`: uint8 [N]. `viewmat`: float32 [1, 4, 4].
-        """
+        """Return which Gaussians a view, float32 [1, 4, 4], keeps, bool [N]; only for a single process."""
         active = self.active({"means": means, "level": level}, viewmat)
         return torch.ones_like(level, dtype=torch.bool) if active is None else active.views != 0
 

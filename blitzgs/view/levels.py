@@ -47,10 +47,8 @@ class Levels:
 def farthest(level: int, reference_distance: float, fork: float) -> float:
     """Return the largest distance from which a level is resolvable, in the unit of `reference_distance`.
 
-    BlitzGS Eq. 1 rounds log_f(d_0 / d) to the nearest integer, so level l is resolvable up to
-    d = d_0 f^(1/2 - l). Level 0 is resolvable from any distance.
-
-    `level`: l. `reference_distance`: d_0. `fork`: f.
+    BlitzGS Eq. 1 rounds log_f(d_0 / d), f the fork, to the nearest integer, so level l is resolvable up to d
+    = d_0 f^(1/2 - l). Level 0 is resolvable from any distance.
     """
     return math.inf if level == 0 else reference_distance * fork ** (0.5 - level)
 

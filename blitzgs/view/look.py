@@ -38,10 +38,7 @@ class Look:
     far: float | None = None  # far plane; None: the model's
 
     def __post_init__(self) -> None:
-        """Check the values, which come from a browser.
-
-        ValueError: a value is impossible; the message names it.
-        """
+        """Check the values, which come from a browser (ValueError: one is impossible, by name)."""
         if self.mode not in MODES:
             raise ValueError(f"mode must be one of {', '.join(MODES)}, got {self.mode!r}")
         for name, size in (("width", self.width), ("height", self.height)):

@@ -142,11 +142,7 @@ class WayBack:
     places: Tensor  # positions of this rank's own splats among those that it sent, from `scatter_splats`
 
     def check_still_valid(self) -> None:
-        """Check that gradients of this frame can still be returned.
-
-        RuntimeError: a later frame has overwritten this frame's splats, which happens only where ranks share
-        memory.
-        """
+        """Check that no later frame has overwritten this one's splats (RuntimeError: ranks share memory)."""
 
     def cleared_table(self) -> Tensor | None:
         """Zero `gradient_table` for another backward pass, when no rank reads it any more. Collective.
