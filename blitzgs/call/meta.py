@@ -55,6 +55,8 @@ class LazyDict(dict[str, Any]):
     setdefault = MutableMapping.setdefault
     values = Mapping.values  # type: ignore[assignment]
     items = Mapping.items  # type: ignore[assignment]
+    __eq__ = Mapping.__eq__
+    __ne__ = object.__ne__  # the inverse of `__eq__`
 
     def pop(self, key: str, *default: Any) -> Any:
         """Remove a key and return its value, or `default`."""
@@ -69,12 +71,6 @@ class LazyDict(dict[str, Any]):
     def copy(self) -> dict[str, Any]:
         """Return a plain dict of the same values."""
         return dict(self)
-
-    def __eq__(self, other: object) -> bool:
-        return dict(self) == other
-
-    def __ne__(self, other: object) -> bool:
-        return dict(self) != other
 
     def __or__(self, other: Any) -> Any:
         return dict(self) | other

@@ -7,7 +7,7 @@ import inspect
 import math
 from collections.abc import Iterable, Mapping
 from functools import cache
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,15 +29,6 @@ from blitzgs.call.channels import ImageOptions, background_rows
 from blitzgs.call.rasterize import rasterization
 from blitzgs.call.render import ShTables, gathered_groups, groups_may_be_queued, groups_of, render
 from blitzgs.ops.derivatives import of_shape
-
-
-class CatchesUp(Protocol):
-    """An optimiser that may have pending steps, such as `blitzgs.optim.LazyAdam`."""
-
-    def catch_up(
-        self, params: Iterable[Tensor] | None = None, rows: Tensor | None = None, count: Tensor | None = None
-    ) -> None:
-        """Apply the pending steps of rows of parameters, see `blitzgs.optim.LazyAdam.catch_up`."""
 
 
 @not_compiled
@@ -63,7 +54,7 @@ def raw_rasterization(
     sparse_grad: bool = True,
     absgrad: bool = False,
     rasterize_mode: str = "classic",
-    optimizers: CatchesUp | Iterable[Any] | Mapping[str, Any] = (),
+    optimizers: Any = (),
     **further: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render Gaussians from the parameters that gsplat's trainer learns, before their activation.
@@ -167,7 +158,8 @@ def _check_leaves(params: Mapping[str, Tensor]) -> None:
             )
 
 
-def _lazy(optimizers: Any) -> list[CatchesUp]:
+def _lazy(optimizers: Any) -> list[Any]:
+    """Return the optimisers that may have pending steps, as `blitzgs.optim.LazyAdam`."""
     if isinstance(optimizers, torch.optim.Optimizer) or hasattr(optimizers, "catch_up"):
         optimizers = [optimizers]
     if not isinstance(optimizers, Iterable):

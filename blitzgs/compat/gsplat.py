@@ -288,10 +288,7 @@ class MCMCStrategy(Strategy):
 
         Args:
             params: changed in place: means move, and a refinement replaces the entries.
-            optimizers: as in `DefaultStrategy`.
-            state: from `initialize_state`.
-            step: number of the step.
-            info: not read.
+            optimizers, state, step: as in `DefaultStrategy`; `info` is not read.
             lr: learning rate of the means.
             scene: told of the changes (`on_relocate`, `on_sample_add`), as gsplat's main branch has it.
         """

@@ -164,16 +164,11 @@ def project(
         viewmats: [B, 4, 4] world to camera, a rotation and a translation; B <= 32.
         Ks: [B, 3, 3] pinhole intrinsics in px; a view with a skew, or another last row than 0, 0, 1, sees
             nothing.
-        width: image width in px.
-        height: image height in px.
+        width, height, near_plane, far_plane, eps2d, radius_clip: as in `blitzgs.rasterization`.
         active_ids: int32 [A], the rows to consider, ascending; None: all rows.
         active_views: int32 [A], the views to consider for each of these rows, as bits; None: all views.
         tile_size: edge of a tile in px (only for `tiles_touched`).
         sh_degree: degree to evaluate, 0 to 3.
-        near_plane: splats have z > near_plane, world units.
-        far_plane: splats have z <= far_plane, world units.
-        eps2d: variance added to both screen axes, px^2.
-        radius_clip: drop splats whose radius is at most this, px.
         antialiased: multiply opacities by sqrt(det / det'), the determinants before and after adding eps2d.
         raw: whether scales and opacities are before their activation.
         sparse_grad: return gradients as sparse tensors of the visible Gaussians, so that no pass over all N

@@ -72,13 +72,9 @@ def rasterize(
         colors: [P, D], D from 1 to 4096.
         isect_splats: int32 [I], from `blitzgs.ops.intersect.intersect`.
         tile_offsets: int64 [B * T + 1], from the same call.
-        n_cameras: number of views B.
-        width: of every view, pixels.
-        height: of every view, pixels.
-        tile_size: edge of a tile in pixels, as given to ``intersect``.
+        n_cameras, width, height, tile_size, tile_begin, tile_end: as given to ``intersect``; the pixels of
+            tiles outside [tile_begin, tile_end) are zero.
         backgrounds: [B, D], or None for black.
-        tile_begin: first owned tile; pixels of tiles outside [tile_begin, tile_end) are zero.
-        tile_end: end of the owned tiles, -1 for all.
         store_absgrad: the backward pass calls it with the sum over pixels of the absolute gradient of
             means2d, per axis, [P, 2], whichever gradients it computes.
         composited: the result of the op `rasterize_fwd` for these arguments and alphas, if they are already

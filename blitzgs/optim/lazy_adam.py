@@ -15,7 +15,6 @@ from blitzgs.ops.derivatives import KeptMarks, distinct_rows
 from blitzgs.ops.lazy_adam import GrowingSchedule
 from blitzgs.optim.lazy_adam_checks import (
     MOMENTS,
-    check_chosen,
     check_group,
     check_listed,
     check_mask,
@@ -24,6 +23,7 @@ from blitzgs.optim.lazy_adam_checks import (
     check_param,
     check_rows,
     check_saved,
+    check_tensor,
     groups_by_name,
 )
 from blitzgs.util.errors import warn
@@ -202,7 +202,9 @@ class LazyAdam(torch.optim.Optimizer):
         if isinstance(params, Tensor):
             params = [params]
         given = list(params or ())
-        check_chosen(given)
+        for param in given:
+            if not isinstance(param, Tensor):  # as a name
+                check_tensor("catch_up: params", param)
         chosen = None if params is None else set(map(id, given))
         for group, index, param in self._places():
             if (chosen is not None and id(param) not in chosen) or _STEPS[0] not in self.state.get(param, ()):

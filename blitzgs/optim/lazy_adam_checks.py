@@ -50,15 +50,9 @@ def check_rows(param: Tensor, state: Mapping[str, Any]) -> None:
             )
 
 
-def check_chosen(params: Sequence[Tensor]) -> None:
-    """Check the parameters that `catch_up` takes (TypeError: one is not a tensor, as a name)."""
-    for param in params:
-        _check_tensor("catch_up: params", param)
-
-
 def check_listed(rows: Tensor, count: Tensor | None, param: Tensor) -> None:
     """Check the rows that `catch_up` takes, on the CPU (on CUDA, the host would wait for them)."""
-    _check_tensor("catch_up: rows", rows)
+    check_tensor("catch_up: rows", rows)
     if rows.is_cpu:
         listed = rows if count is None else rows[: int(count)]
         low, high = map(int, torch.aminmax(listed)) if len(listed) > 0 else (0, -1)
@@ -108,7 +102,7 @@ def check_new_rows(rows: Mapping[str, Tensor], named: Groups) -> int:
         raise ValueError(f"LazyAdam.append: rows for {sorted(named)} are needed, got {sorted(rows)}")
     for name, group in named.items():
         new, old = rows[name], group["params"][0]
-        _check_tensor(f"append: new rows of {name}", new)
+        check_tensor(f"append: new rows of {name}", new)
         if new.dim() == 0 or new.shape[1:] != old.shape[1:]:
             wanted = ", ".join(("M", *map(str, old.shape[1:])))
             raise ValueError(f"LazyAdam.append: new rows of {name} must be [{wanted}], got {list(new.shape)}")
@@ -120,7 +114,7 @@ def check_new_rows(rows: Mapping[str, Tensor], named: Groups) -> int:
 
 def check_mask(mask: Tensor, named: Groups) -> None:
     """Check the mask that `keep` takes."""
-    _check_tensor("keep: mask", mask)
+    check_tensor("keep: mask", mask)
     if mask.dtype != torch.bool:
         raise ValueError(f"LazyAdam.keep: mask must be bool, got {mask.dtype}")
     for name, group in named.items():
@@ -135,7 +129,7 @@ def check_mask(mask: Tensor, named: Groups) -> None:
 
 def check_order(order: Tensor, named: Groups) -> None:
     """Check the order that `permute` takes."""
-    _check_tensor("permute: order", order)
+    check_tensor("permute: order", order)
     if order.dtype != torch.int64 or order.dim() != 1:
         raise ValueError(
             f"LazyAdam.permute: order must be int64 [N'], the old rows, got {order.dtype} "
@@ -160,7 +154,8 @@ def check_order(order: Tensor, named: Groups) -> None:
         )
 
 
-def _check_tensor(argument: str, value: object) -> None:
+def check_tensor(argument: str, value: object) -> None:
+    """Check that an argument of a method is a tensor (TypeError: it is not)."""
     if not isinstance(value, Tensor):
         raise TypeError(f"LazyAdam.{argument} must be a torch.Tensor, got {type(value).__name__}")
 

@@ -89,13 +89,9 @@ def relocate(
     # of them undo what a run has learnt (docs/decisions.md). No variable keeps the columns, because `replace`
     # frees those that it makes longer.
     share_rows_(
-        table["opacities"],
-        table["scales"],
-        (*table.exp_avgs, *table.exp_avg_sqs),
-        sources,
-        copies + 1,
+        table["opacities"], table["scales"], (*table.exp_avgs, *table.exp_avg_sqs), sources, copies + 1,
         opacity_logit(rules.min_opacity),
-    )
+    )  # fmt: skip
     # Slots after those of clones and splits, which may have the same parents in the same event.
     first = (copies.cumsum(0) - copies).repeat_interleave(copies, output_size=len(parents))
     slots = torch.arange(len(parents), device=parents.device) - first + (CHILDREN_OF_A_SPLIT + 1)
@@ -167,15 +163,8 @@ class PositionNoise:
 
     def add(self, table: GaussianTable, visible_ids: Tensor, step: int, position_rate: float) -> None:
         """Add noise to the means of rows, int32 [U], current up to `step`; the rate is that of the means."""
+        means, quats, scales, opacities, _ = table.parameters
         position_noise_(
-            table["means"],
-            table["quats"],
-            table["scales"],
-            table["opacities"],
-            table["id"],
-            visible_ids,
-            seed=self.seed,
-            step=step,
-            threshold=self.threshold,
-            strength=self.factor * position_rate / self.extent**2,
-        )
+            means, quats, scales, opacities, table["id"], visible_ids, seed=self.seed, step=step,
+            threshold=self.threshold, strength=self.factor * position_rate / self.extent**2,
+        )  # fmt: skip

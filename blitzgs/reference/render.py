@@ -164,15 +164,11 @@ def render(
         colors: SH coefficients [N, K, 3] with `sh_degree`, else values [N, D].
         viewmat: [4, 4] world to camera.
         K: [3, 3].
-        width: px.
-        height: px.
+        width, height, near_plane, far_plane, eps2d: as for `blitzgs.rasterization`.
         sh_degree: degree to evaluate, or None.
         background: [D] colour behind everything; None for black. Depth has none.
         render_mode: RGB, D (sum of weight times z), ED (that over alpha), RGB+D or RGB+ED.
-        near_plane: Gaussians have z > near_plane.
-        far_plane: Gaussians have z <= far_plane.
-        eps2d: variance added to both screen axes, px^2.
-        antialiased: compensate the opacity for that addition.
+        antialiased: compensate the opacity for the addition of eps2d.
         tolerance: see `composite`.
     """
     tensors: Any = (tensor.double() for tensor in (means, quats, scales, opacities, colors, viewmat, K))
