@@ -66,8 +66,7 @@ class Scene(NamedTuple):
     colors: Tensor | None  # SH [N, K, 3] or [C, N, K, 3], values [N, D] or [C, N, D]; None: depth alone
     viewmats: Tensor  # [C, 4, 4]
     Ks: Tensor  # [C, 3, 3]
-    # Covariances given instead of quats and scales; quats and scales then are their decomposition.
-    covariances: Decomposed | None = None
+    covariances: Decomposed | None = None  # given instead of quats and scales, which are of them then
     lenses: Lenses | None = None  # lenses and shutters of the views; None: pinhole cameras
 
 
@@ -84,8 +83,7 @@ class Gaussians(NamedTuple):
     per_view: bool  # whether every view has its own colours
     lead: tuple[int, ...]  # the batch dimensions, and C
     raw: bool  # whether scales and opacities are before their activation
-    # The arguments of the call that have to be finite, a tensor for each scene.
-    named: Mapping[str, tuple[Tensor, ...]]
+    named: Mapping[str, tuple[Tensor, ...]]  # the arguments that have to be finite, one for each scene
     signals: Signals | None = None  # the extra signals; None: none
 
     @property

@@ -88,11 +88,7 @@ def split_channels(
 
 
 def _signals(splats: ProjectedSplats, gaussians: Gaussians, with_spare: bool) -> Tensor:
-    """Return the extra signals of P splats, [P, E].
-
-    SH are evaluated as colours are, along the direction from the camera centre, but not clamped:
-    sum of Y_k(direction) c_k, plus 0.5. Differentiable in the signals and, for SH, in means and viewmats.
-    """
+    """Return the extra signals of P splats, [P, E]; SH are evaluated as for colours, but not clamped."""
     signals = gaussians.signals
     assert signals is not None
     rows = _rows(splats, gaussians, signals.per_view, with_spare)

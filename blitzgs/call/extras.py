@@ -92,8 +92,7 @@ def with_lenses(
     camera_model: str,
     rolling_shutter: Any,
     ut_params: Any,
-    # whether arguments that the unscented projection does not support are given, by what to call them
-    refused: Mapping[str, bool],
+    refused: Mapping[str, bool],  # unsupported arguments, by what to call them: are they given?
     radial_coeffs: Tensor | None,
     tangential_coeffs: Tensor | None,
     thin_prism_coeffs: Tensor | None,

@@ -323,10 +323,9 @@ class _L1Ssim(torch.autograd.Function):
 def _constants(
     views: int, count: int, weight: float, dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what the loss of views without a mask needs; each tensor would cost a launch in every step.
+    """Return weights of the sums of L1 and SSIM, and their divisors, [B] each, for views without a mask.
 
-    `views`: number of views B. `count`: values that the mean of a view averages, at least 1. Returns the
-    weights of the sums of L1 and SSIM and their divisors, [B] each.
+    Each of these tensors would cost a launch in every step. `count`: values that the mean of a view averages.
     """
     values = ((1 - weight) / views, -weight / views, count)
     l1, ssim, divisors = (torch.full((views,), value, dtype=dtype, device=device) for value in values)

@@ -34,8 +34,7 @@ class Places(NamedTuple):
     # int32 [P] each: a splat is the entry [image, Gaussian] of an arrangement of all Gaussians in all images,
     # and no two splats have the same entry.
     indices: tuple[Tensor, ...]
-    # Dimensions of the arrangement, [P] or [..., C, N], where the images are counted through [..., C].
-    shape: tuple[int, ...]
+    shape: tuple[int, ...]  # of the arrangement: [P], or [..., C, N] with images counted by [..., C]
 
     def flat(self) -> Tensor:
         """Return the place of each splat in the flat arrangement, int64 [P]."""
@@ -46,11 +45,10 @@ class Places(NamedTuple):
         return images.long() * self.shape[-1] + gaussians
 
     def arrange(self, columns: Sequence[Tensor], under: Tensor | None = None) -> tuple[Tensor, ...]:
-        """Arrange columns of splats.
+        """Arrange columns of splats, [P, ...] with elements of 4 or 8 bytes; return [*shape, ...] of each.
 
-        `columns`: [P, ...] each, with elements of 4 or 8 bytes. `under`: values of the Gaussians, [..., N],
-        that entries of the last column have if they have no splat; None: zeros, as in the other columns.
-        Returns the columns, [*shape, ...].
+        `under`: values of the Gaussians, [..., N], that entries of the last column have if they have no
+        splat; None: zeros, as in the other columns.
         """
         if torch.compiler.is_compiling():  # torch differentiates them, and tracing a Function is fragile
             return self._arranged_by_torch(columns, under)

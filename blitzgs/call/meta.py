@@ -29,11 +29,7 @@ _NOTHING_KNOWN = dict.fromkeys((*_KEYS, "non_finite"), LATER)
 
 
 class LazyDict(dict[str, Any]):
-    """A dict with values that are computed when they are first read.
-
-    In every other way it is a dict: readers find values only, copies and pickles are plain dicts, and any
-    value may be replaced or deleted.
-    """
+    """A dict with values that are computed when they are first read; copies and pickles are plain dicts."""
 
     def __init__(self, given: Mapping[str, Any], compute: Callable[[str], Any]) -> None:
         """Begin with values by key; `LATER` for one that `compute` returns, given the key."""
@@ -122,8 +118,7 @@ def make_meta(
     others: Mapping[str, Tensor],  # further images by key
     lists: Lists,
     lead: tuple[int, ...],  # batch dimensions, and the number of views that are rendered here
-    # the splats that `lists` refers to, if ranks have exchanged splats; None: those of `layout`
-    arrived: ProjectedSplats | None,
+    arrived: ProjectedSplats | None,  # the splats of `lists`, if ranks exchanged some
 ) -> dict[str, Any]:
     """Return `meta`; entries that the image did not need are computed when they are first read.
 

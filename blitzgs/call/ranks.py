@@ -26,10 +26,9 @@ from blitzgs.ops.projection_types import ProjectedSplats
 def gather_views(gaussians: Gaussians, absgrad: bool, same: Sequence[Any]) -> tuple[Gaussians, Ranks | None]:
     """Return this rank's Gaussians with the views of all ranks, M C, in the order of ranks. Collective.
 
-    `gaussians`: one scene, with the rank's own views. `same`: values that must be equal on all ranks. Also
-    returns the job; None if there is one rank. ValueError: there are batch dimensions, colours per view or
-    absolute gradients, which ranks do not exchange; or, on every rank: the ranks differ in `same`, in their
-    number of views, or in whether Gaussians or poses need gradients, and would wait for others forever.
+    `gaussians`: one scene with own views. `same`: values that must be equal on all ranks. Also returns the
+    ranks; None if there is one. ValueError: there is what ranks do not exchange; or, on every rank: they
+    differ in `same`, in the number of views, or in what needs gradients, and would wait for others forever.
     """
     per_view = gaussians.per_view or (gaussians.signals is not None and gaussians.signals.per_view)
     if len(gaussians.lead) > 1 or per_view or absgrad:
@@ -71,10 +70,9 @@ def send_splats(
 ) -> tuple[ProjectedSplats, Tensor]:
     """Send each splat to the rank that renders its view. Collective, as is its backward pass.
 
-    `splats`: of this rank's Gaussians in the views of all ranks, of which each has `views`. `channels`:
-    channels to composite, [P, D].
-    Returns the splats of this rank's views, ordered by (rank, Gaussian, view), and their channels. Only the
-    columns that tile lists and images need are valid.
+    `splats`: of this rank's Gaussians in all ranks' views, of which each has `views`, with their channels [P,
+    D]. Returns those of this rank's views, ordered by (rank, Gaussian, view), with only the columns that tile
+    lists and images need.
     """
     images = splats.camera_ids.long()
     destinations = images // views

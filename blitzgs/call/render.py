@@ -54,11 +54,9 @@ class Group(NamedTuple):
 
     inputs: ProjectionInputs
     first_image: int  # number of its first view among the images of the call
-    # The covariances that the caller gave instead of quats and scales; None: none.
-    covariances: Decomposed | None
+    covariances: Decomposed | None  # given by the caller instead of quats and scales; None: none
     lenses: Lenses | None  # lenses and shutters of the views; None: pinhole cameras
-    # int64 [A], the rows of the caller's tables that `inputs` has; None: all.
-    ids: Tensor | None = None
+    ids: Tensor | None = None  # int64 [A], the rows of the caller's tables in `inputs`; None: all
 
 
 class ShTables(NamedTuple):
@@ -74,12 +72,9 @@ def render(
     gaussians: Gaussians,
     projection: ProjectionOptions,
     image: ImageOptions,
-    # the SH, if only the rows of visible Gaussians are read; only where `groups_may_be_queued`
-    tables: ShTables | None = None,
-    # those among which the Gaussians and views are divided; None: this process has all of them
-    ranks: Ranks | None = None,
-    # `groups_of` the Gaussians, which have SH, if they are already known
-    groups: Sequence[Group] | None = None,
+    tables: ShTables | None = None,  # the SH, if only visible rows are read (`groups_may_be_queued`)
+    ranks: Ranks | None = None,  # among which Gaussians and views are divided; None: all here
+    groups: Sequence[Group] | None = None,  # `groups_of` Gaussians with SH, if already known
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render images; return the results of `blitzgs.rasterization`."""
     compiling = torch.compiler.is_compiling()
@@ -155,11 +150,7 @@ def _render_queued(
     only_colors: bool,  # whether the colours that the projection computes are all channels
     tables: ShTables | None,  # the SH, if they are not part of `inputs`
 ) -> _Queued:
-    """Render without gradients; the differentiable ops take this result instead of computing it again.
-
-    If earlier calls had the same size, the host queues all work first and reads the number of splats while
-    the GPU works.
-    """
+    """Render without gradients; the host queues all work first if earlier calls had the same size."""
     options, means, signals = inputs.options, inputs.gaussians[0], gaussians.signals
     rows_of, sh = ((), ()) if tables is None else (inputs.gaussians, tables.parts)
     # Hooks on saved tensors (checkpointing) need the same shapes each time, without spare capacity.
@@ -326,10 +317,9 @@ def gathered_groups(groups: Sequence[Group], sh: ShTables, sparse_grad: bool) ->
 
 
 def _project_groups(groups: Sequence[Group], sparse_grad: bool) -> ProjectedSplats:
-    """Return the splats of all images, those of a group after those of the groups before.
+    """Return the splats of all images, group by group; their camera_ids number all images of the call.
 
-    `sparse_grad`: see `blitzgs.ops.project.project`. Returns splats whose camera_ids number all images of the
-    call. Of several groups, visible_ids and splat_offsets have no meaning.
+    Of several groups, visible_ids and splat_offsets have no meaning.
     """
     parts = []
     for group in groups:

@@ -55,8 +55,7 @@ class RenderOptions:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB behind everything
     tile_size: int = 16  # pixels
     deterministic: bool = False  # gradients repeat bit for bit on CUDA too (they always do on the CPU)
-    # Opacities fade by octree level and distance, `blitzgs.view.gate.LodGate.fade`; empty: they do not.
-    fade: tuple[float, ...] = ()
+    fade: tuple[float, ...] = ()  # `blitzgs.view.gate.LodGate.fade`; empty: opacities do not fade
 
     @property
     def limits(self) -> tuple[float, float, float]:
@@ -80,8 +79,7 @@ class Frame(NamedTuple):
     splats: Splats  # the splats that this rank composited: its own, or those that it received
     assignment: TileAssignment | None  # the tiles of each rank; None: one rank composites all
     way_back: WayBack | None  # returns the gradients of splats to their owners; None: one rank owns all
-    # int64 [B], Gaussians visible in each view, over all ranks; valid until the next exchange.
-    visible: Tensor
+    visible: Tensor  # int64 [B], Gaussians seen by each view, of all ranks; valid until the next exchange
     active: ActiveRows | None  # rows that were considered, and the views of each; None: all
     renders: Tensor  # [B, H, W, 3]; undefined in pixels that only other ranks composite
     tile_work: Tensor  # int32 [B * T], list entries each composited tile went through
@@ -96,17 +94,13 @@ def render_frame(
     # rows to consider, and the views of each; None: all rows in all views. Or a function that finds them,
     # given the capacity for the frame (see `run_attempts`).
     active: ActiveRows | Callable[[Sizes | None], ActiveRows] | None = None,
-    # the tiles of each rank; every rank of the job calls this with its table. None: render all tiles from
-    # this table alone.
-    assignment: TileAssignment | None = None,
+    assignment: TileAssignment | None = None,  # tiles of each rank (collective); None: all are here
     # sends the splats to the ranks that composite them. A transport that is used for several frames estimates
     # the sizes of a frame from the frames before, so that the device need not wait for the host; the result
     # does not depend on it. None: a new one.
     transport: Transport | None = None,
-    # prepare for a backward pass, which is then faster; the backward pass also works without
-    backward_follows: bool = False,
-    # the colour behind everything in each view, float32 [B, 3]; None: that of the options
-    backgrounds: Tensor | None = None,
+    backward_follows: bool = False,  # makes a backward pass faster, which also works without
+    backgrounds: Tensor | None = None,  # colours [B, 3] behind everything; None: of the options
 ) -> Frame:
     """Render views of a table whose active rows have no pending optimiser steps.
 
@@ -258,17 +252,14 @@ class Survey(NamedTuple):
     splats: ProjectedSplats  # the projected Gaussians
     weights: Tensor  # int64 [P], sum of alpha T over the pixels in units of 2^-32
     pixels: Tensor  # int32 [P], the number of pixels at which a splat is composited
-    # int64 [P], sum of (alpha T)^2 over these pixels in the same units, if asked for.
-    squares: Tensor | None = None
+    squares: Tensor | None = None  # int64 [P], sum of (alpha T)^2 in these units, if asked for
 
 
 def survey(
     table: GaussianTable,
     views: Views,  # at most 32 views
     options: RenderOptions,  # how to render; no colour is computed
-    # the tiles of each rank; every rank of the job calls this with its table. None: this rank composites all
-    # tiles.
-    assignment: TileAssignment | None = None,
+    assignment: TileAssignment | None = None,  # tiles of each rank (collective); None: all are here
     transport: Transport | None = None,  # as for `render_frame`
     active: ActiveRows | None = None,  # as for `render_frame`
     squares: bool = False,  # whether to sum the squares as well

@@ -95,11 +95,7 @@ class TileAssignment:
 
 
 def collect_images(renders: Tensor, ranges: TileRanges, ranks: Ranks, destination: int) -> None:
-    """Send all pixels of a rendering to one rank, which stores them in its `renders`, bit for bit.
-
-    `renders`: [B, H, W, C], contiguous; valid in this rank's tiles. `destination`: the rank whose `renders`
-    is complete afterwards.
-    """
+    """Send all pixels of a rendering, [B, H, W, C], contiguous, to one rank, whose `renders` gets them."""
     if ranks.world_size == 1:
         return
     here, area = ranks.rank == destination, ranges.tile_size**2
@@ -117,11 +113,7 @@ def collect_images(renders: Tensor, ranges: TileRanges, ranks: Ranks, destinatio
 
 
 def _pixels(stretches: list[tuple[int, int]], ranges: TileRanges, device: torch.device) -> Tensor:
-    """List the flat pixel indices of stretches of tiles, tile by tile, tile_size^2 each.
-
-    Tiles that extend beyond the image repeat its border pixels, in the same way on the sender and the
-    receiver.
-    """
+    """List the flat pixels of stretches of tiles, tile by tile; beyond the image, its border is repeated."""
     parts = [torch.arange(low, high, device=device) for low, high in stretches]
     tiles = torch.cat(parts) if parts else torch.empty(0, dtype=torch.int64, device=device)
     view, tile = tiles // ranges.tiles_per_view, tiles % ranges.tiles_per_view

@@ -37,8 +37,7 @@ class GateRules(NamedTuple):
     reach: list[float]
     lod_views: int  # bit v is set when view v has an LOD gate
     cull: Tensor | None = None  # int32 [ceil(N / 256), columns, 8], of `blitzgs.ops.blocks`; None: none
-    # Columns of `cull`, one for each view; negative: the view has no mask. Empty: no view has one.
-    columns: list[int] = []  # noqa: RUF012  (never changed)
+    columns: list[int] = []  # noqa: RUF012  (never changed)  # columns of `cull`, one a view; negative: none
 
 
 class ActiveRows(NamedTuple):
@@ -92,12 +91,9 @@ def cull_blocks(
     means: Tensor,  # float32 [N, 3]
     scales: Tensor,  # float32 [N, 3], logarithms of the standard deviations
     views: Views,
-    # near plane, far plane (rows at z <= near or z > far are not seen), and eps2d, the blur on the screen,
-    # pixels squared
-    limits: tuple[float, float, float],
+    limits: tuple[float, float, float],  # near and far plane (near < z <= far), blur eps2d, px^2
     pending: PendingSteps | None = None,  # as given to `update_block_bounds_`
-    # uint8 [ceil(N / 256), 2], coarsest and finest level of each block; needed for `rules`
-    level_ranges: Tensor | None = None,
+    level_ranges: Tensor | None = None,  # uint8 [blocks, 2], coarsest and finest level; for `rules`
     # also drop the rows that these rules leave out wherever their pending steps may move them; `gate_views_`
     # decides about the remaining rows. None: no rules.
     rules: GateRules | None = None,
@@ -184,10 +180,8 @@ def seen_blocks(
 @torch.no_grad()
 def swap_blocks_(
     pool: Sequence[Tensor],  # columns [P, ...]
-    # the same columns [N, ...] in the memory of the host; pinned where the pool is on a GPU
-    table: Sequence[Tensor],
-    # only the first `n_written` columns are written back; the others never change on the device
-    n_written: int,
+    table: Sequence[Tensor],  # the same columns [N, ...] on the host; pinned for a GPU
+    n_written: int,  # how many of the columns are written back; the others never change here
     slots: Tensor,  # int32 [M], on the device of the pool
     leaving: Tensor,  # int32 [M], on the same device; -1: the slot's contents are discarded
     coming: Tensor,  # int32 [M], on the same device; -1: nothing is read into the slot
@@ -206,8 +200,7 @@ def swap_blocks_(
 def take_rows(
     columns: Sequence[Tensor],  # [N, ...], any dtypes
     rows: Tensor,  # int64 [M], from 0 to N - 1; not checked
-    # [M, ...], contiguous, get the rows; they may not overlap the columns. None: new tensors.
-    out: Sequence[Tensor] | None = None,
+    out: Sequence[Tensor] | None = None,  # [M, ...], contiguous, other memory, get the rows; None: new
 ) -> Sequence[Tensor]:
     """Return the rows `rows` of each column, as `column.index_select(0, rows)` does.
 

@@ -47,8 +47,7 @@ KEY_BITS = 32
 
 @torch.no_grad()
 def sampling_keys(
-    # float32 [N], >= 0; zero gives an infinite key, never chosen while a positive one remains
-    weights: Tensor,
+    weights: Tensor,  # float32 [N], >= 0; zero: an infinite key, chosen after all others
     ids: Tensor,  # int64 [N], persistent
     seed: int,
     event: int,  # number that differs between draws

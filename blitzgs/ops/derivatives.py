@@ -98,11 +98,7 @@ def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
 def full_gradients(
     ids: Tensor, gradients: Sequence[Tensor | None], shapes: Sequence[torch.Size], sparse: Sequence[bool]
 ) -> list[Tensor | None]:
-    """Return the gradients of whole parameters from those of their rows, as sparse or dense tensors.
-
-    `ids`: int32 or int64 [U], ascending, each once. `gradients`: [U, ...] of each parameter; None: it needs
-    none. `shapes`: [N, ...] of each. `sparse`: which of the results are sparse.
-    """
+    """Return the gradients of parameters from those of their rows `ids` [U], each once; None: not needed."""
     ids = ids.long()
     return [
         None

@@ -65,8 +65,7 @@ def words_of(column: Tensor) -> Tensor:
 
 
 def tile_costs(
-    # float32 [first + B T] on the CPU, the costs of the T tiles of each view from `first` on, >= 0
-    sums: Tensor,
+    sums: Tensor,  # float32 [first + B T] on the CPU: T costs >= 0 of each view from `first` on
     first: int,  # index of the first cost
     views: int,  # B
     grain: int,  # over how many tiles a stored cost averages

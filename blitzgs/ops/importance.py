@@ -24,8 +24,7 @@ class ViewSums(NamedTuple):
 
     score: Tensor  # int64 [N]
     seen: Tensor  # int32 [N], number of views in which the Gaussian is visible (radius > 0)
-    # int32 [N], number of views in which it counts (it is in the top 99 % of the view's weight).
-    counted: Tensor
+    counted: Tensor  # int32 [N], number of views in which it counts (is in the top 99 % of the weight)
     cull: Tensor  # int32 [N, words], bit v % 32 of word v / 32 set where it does not count in view v
 
 
@@ -59,8 +58,7 @@ class PixelSplats(NamedTuple):
 
     transmittances: Tensor  # [R], the share of light that passes all splats
     counts: Tensor  # int32 [R], the number of composited splats
-    # int32 [R], the last composited splat with a transmittance above 0.5 in front of it, -1 for none.
-    medians: Tensor
+    medians: Tensor  # int32 [R], the last composited splat with T above 0.5 in front of it, -1 for none
     ids: Tensor  # int32 [R, k], the splats of the largest alpha T, front to back; then -1
     weights: Tensor  # [R, k], their alpha T; then 0
 

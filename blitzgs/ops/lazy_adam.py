@@ -27,8 +27,7 @@ _NEGLIGIBLE = {torch.float32: 2.0**-27, torch.float64: 2.0**-56}
 class AdamState(NamedTuple):
     """The optimiser's state of a table of N rows, as the ops that move parameters take it."""
 
-    # (means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, K, 3]), or one parameter.
-    params: Sequence[Tensor]
+    params: Sequence[Tensor]  # means [N, 3], quats, scales, opacities [N], sh [N, K, 3]; or one parameter
     exp_avgs: Sequence[Tensor]  # first moments, shaped like `params`
     exp_avg_sqs: Sequence[Tensor]  # second moments, shaped like `params`
     last_step: Tensor  # int32 [N], the step that each row's parameters stand at
@@ -175,8 +174,7 @@ def lazy_adam_catch_up_(
     schedule: AdamTables,  # of S steps, for the dtype of the parameters
     step: int,  # 0 <= step <= S; 0: nothing to do
     ids: Tensor | None = None,  # int32 or int64 [A], the rows, each once; None: all
-    # int32 [1], only the first `count` of `ids` are rows; the host does not wait for it. None: all.
-    count: Tensor | None = None,
+    count: Tensor | None = None,  # int32 [1], only so many `ids` are rows, the first ones; None: all
 ) -> None:
     """Apply the missed zero-gradient steps up to ``step`` to the rows `ids` (None: all), in place.
 

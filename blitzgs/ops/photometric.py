@@ -16,8 +16,7 @@ from blitzgs.ops.derivatives import first_only
 def photometric_loss(
     renders: Tensor,  # x [B, H, W, 3], float32 (CPU also float64), nominal range [0, 1]
     targets: Tensor,  # y [B, H, W, 3], uint8 (value / 255) or the dtype of `renders`
-    # [B, H, W], bool or uint8, 0 = excluded; windows centred at other pixels still read such a pixel
-    masks: Tensor | None = None,
+    masks: Tensor | None = None,  # [B, H, W], bool or uint8, 0 = excluded; windows still read it
     ssim_weight: float = 0.2,  # w in [0, 1]
 ) -> Tensor:
     """Return ``(1 - w) mean |x - y| + w (1 - mean SSIM)`` of each view; differentiable in `renders`.
@@ -31,10 +30,9 @@ def photometric_loss(
 
 
 def ssim(renders: Tensor, targets: Tensor, masks: Tensor | None = None) -> Tensor:
-    """Return the mean SSIM [B] of each view over unmasked pixels and channels; differentiable in `renders`.
+    """Return the mean SSIM [B] of each view over unmasked pixels and channels, as for `photometric_loss`.
 
     11 x 11 Gaussian window of sigma 1.5, C1 = 0.01^2, C2 = 0.03^2, zero padding (Wang et al. 2004).
-    Arguments and errors as in `photometric_loss`.
     """
     return photometric_sums(renders, targets, masks)[1] / pixel_counts(renders, masks).clamp_min(1)
 
@@ -64,12 +62,8 @@ def photometric_fwd_bwd(
     *,
     samples: Tensor | None = None,  # [B], divisors of the weights, dtype of `renders`; None: 1
     visible: Tensor | None = None,  # int64 [B], number of Gaussians visible in each view
-    # weight of L_scale, a view's mean smallest axis of its visible Gaussians; only used to return the weight
-    # of a single Gaussian's axis
-    scale_weight: float = 0.0,
-    # weight of L_opacity, the mean over the views of the mean opacity of their visible Gaussians; only used
-    # to return the weight of a single Gaussian's opacity
-    opacity_weight: float = 0.0,
+    scale_weight: float = 0.0,  # weight of the mean smallest axis of a view's visible Gaussians
+    opacity_weight: float = 0.0,  # weight of the mean opacity of the views' visible Gaussians
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the sums of `photometric_sums` and the gradient of their weighted total, without autograd.
 
@@ -118,14 +112,12 @@ torch.library.register_autograd("blitzgs::photometric_fwd", _backward, setup_con
 
 
 def report_(
-    # float64 [B, K, 2], of `blitzgs.ops.photometric.photometric_fwd_bwd`; None: no views
-    parts: Tensor | None,
+    parts: Tensor | None,  # float64 [B, K, 2], of `photometric_fwd_bwd`; None: no views
     tile_work: Tensor | None,  # int32 [T], of `rasterize_fwd`; None: no tiles
     tiles: tuple[int, int],  # this rank's [first, one past last)
     rank: int,  # this rank
     n_ranks: int,  # M
-    # float32 [2 M B + T] each, on this device or in peer-accessible memory of other devices
-    targets: Sequence[Tensor],
+    targets: Sequence[Tensor],  # float32 [2 M B + T] each, on this device or a peer of it
 ) -> None:
     """Write this rank's part of the report into all targets.
 

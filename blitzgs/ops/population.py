@@ -19,16 +19,12 @@ def density_stats_(
     grad_count: Tensor,  # int32 [N]
     max_radii: Tensor,  # [N], pixels, dtype of `grad_sum`
     visible_ids: Tensor,  # int32 [U], Gaussians with splats, each once
-    # int32 [U + 1]; splats splat_offsets[u] to splat_offsets[u + 1] are of visible_ids[u]
-    splat_offsets: Tensor,
-    # [P, 2], gradient of the step's loss by the projected means, per pixel; rows may be strided
-    v_means2d: Tensor,
+    splat_offsets: Tensor,  # int32 [U + 1]: where the splats of each of these begin
+    v_means2d: Tensor,  # [P, 2], gradient of the step's loss, per pixel; rows may be strided
     conics: Tensor,  # [P, 3], inverse 2D covariances (a, b, c)
     width: int,  # image width in pixels
     height: int,  # image height in pixels
-    # factor from the gradient of the step's loss to the gradient of one view's loss: B when the step's loss
-    # is a mean over B views
-    weight: float,
+    weight: float,  # number of views B whose mean loss is the step's; else the factor to one view's loss
     phi: Tensor | None = None,  # [N], factor of each Gaussian's gradient; None = 1
 ) -> None:
     """Add one step's splats to the statistics of the visible Gaussians, in place.
@@ -127,8 +123,7 @@ def residual_draws(
 def share_rows_(
     opacities: Tensor,  # float32 [N], logits
     scales: Tensor,  # float32 [N, 3], logarithms
-    # Adam's first moments of the five parameters, then the second ones, float32 [N, ...]
-    moments: Sequence[Tensor],
+    moments: Sequence[Tensor],  # Adam's first moments of all parameters, then the second ones
     rows: Tensor,  # int64 [M], each at most once; not checked
     copies: Tensor,  # int64 [M], 1 to `MAX_COPIES`; the row itself is one
     least: float,  # sharing does not reduce a logit below this

@@ -66,11 +66,7 @@ class ProjectedSplats(NamedTuple):
 
 
 def splats_of(allocated: Sequence[Tensor], sizes: Sizes, counts: Tensor | None = None) -> ProjectedSplats:
-    """Return the valid splats of columns that were allocated with more capacity.
-
-    `allocated`: a `ProjectedSplats`; its `counts` are not read. `sizes`: numbers of valid Gaussians and
-    splats; `blocks` is not read. `counts`: the first three of `sizes` as a CPU tensor, if there is one.
-    """
+    """Return the valid splats of columns with more capacity; `counts`: of `sizes`, if there is a tensor."""
     if allocated[0].shape[0] > sizes.splats or allocated[2].shape[0] > sizes.visible:
         visible, splats = sizes[:2]
         allocated = first_rows(allocated[:12], [splats, splats, visible, visible + 1, *[splats] * 8])
@@ -80,11 +76,7 @@ def splats_of(allocated: Sequence[Tensor], sizes: Sizes, counts: Tensor | None =
 
 
 def first_rows(columns: Sequence[Tensor], lengths: Sequence[int]) -> list[Tensor]:
-    """Return the first rows of columns, at most as many as they have.
-
-    Autograd does not see that these are views: a Function may return views, but its caller could not change
-    them in place.
-    """
+    """Return the first rows of columns, as views that autograd does not know: callers may change them."""
     return torch.ops.blitzgs.first_rows(columns, lengths)
 
 
@@ -132,10 +124,8 @@ class ProjectionInputs(NamedTuple):
     # The Gaussians to consider: the fields of `ActiveRows` (ids, views, length, blocks), of which only ids
     # are required. Empty: all Gaussians in all views.
     active: Sequence[Tensor | None] = ()
-    # int64 [N], persistent ids of the Gaussians; None: do not return the splats' ids.
-    ids: Tensor | None = None
-    # uint8 [N], octree levels, if opacities fade with them (`ProjectionOptions.fade`); else None.
-    level: Tensor | None = None
+    ids: Tensor | None = None  # int64 [N], persistent; None: the splats get no ids
+    level: Tensor | None = None  # uint8 [N], octree levels, if opacities fade with them (`fade`)
 
     @property
     def n_views(self) -> int:

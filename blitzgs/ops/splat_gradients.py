@@ -71,11 +71,10 @@ class SplatGradients(NamedTuple):
         return torch.cat(flat, 1)
 
     def sum_returned(self, values: Sequence[Tensor], places: Tensor, splats: int) -> SplatGradients:
-        """Return the gradients of a rank's own splats, summed over the ranks in their order.
+        """Return the gradients of P own splats, summed over the ranks in their order; zero if sent nowhere.
 
         `values`: [n, F] of each rank, the rows of its `side_by_side` for this rank's splats. `places`: from
-        `blitzgs.ops.exchange.scatter_splats`. `splats`: P. The gradients of splats that went nowhere are
-        zero.
+        `blitzgs.ops.exchange.scatter_splats`.
         """
         columns = self._columns()
         widths = [math.prod(column.shape[1:]) for column in columns]
@@ -110,8 +109,7 @@ class GradientBuffer:
     It serves one backward pass; each later one gets other memory.
     """
 
-    # [P or more, 12], the last output of `rasterize_fwd`; [0, 12] or None if there is none.
-    zeros: Tensor | None
+    zeros: Tensor | None  # [P or more, 12], the last output of `rasterize_fwd`; [0, 12] or None: none
     # Returns zeroed memory for later backward passes. If it is None or returns None, memory is allocated
     # instead.
     others: Callable[[], Tensor | None] | None = None

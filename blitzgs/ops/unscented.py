@@ -24,9 +24,7 @@ class Lenses(NamedTuple):
     # [B, 13]: OpenCV's k1 to k6, p1, p2, s1 to s4 and the largest angle of a fisheye, radians, see
     # `largest_angles`.
     lenses: Tensor
-    # [B, 4, 4], poses at the end of the frame; viewmats then are those at its begin. None: with a global
-    # shutter.
-    viewmats_rs: Tensor | None = None
+    viewmats_rs: Tensor | None = None  # [B, 4, 4], poses at the end of a rolling shutter's frame
     fisheye: bool = False  # whether k1 to k4 are those of OpenCV's fisheye, and the others unused
     # What is exposed first: 0 the top row, 1 the left column, 2 the bottom row, 3 the right column, 4 all at
     # once.

@@ -75,8 +75,7 @@ class TableAdam:
 
     def step(
         self,
-        # the one that was rendered, unchanged since; its visible rows must be current up to `step` - 1
-        table: GaussianTable,
+        table: GaussianTable,  # the one that was rendered, unchanged since; visible rows are current
         frame: Frame,
         gradients: SplatGradients,  # of the frame's splats, from `frame.backward_splats`
         # `scale_reg`, `opacity_reg`: weights per view, [B], of the smallest axis and of the opacity of each

@@ -39,15 +39,11 @@ class DensityRules:
     """The thresholds of a density event, with lengths in the unit of the means."""
 
     grad_threshold: float  # mean 2D-mean gradient norm (half-image units) from which a Gaussian is densified
-    # Gaussians with a largest axis up to this are cloned, larger ones split; 0: all are split.
-    clone_scale: float
+    clone_scale: float  # up to this largest axis Gaussians are cloned, others split; 0: all are split
     min_opacity: float  # Gaussians of lower opacity are pruned
-    # Pixels; Gaussians with a larger radius since the last event are pruned. None: none are.
-    max_screen_radius: float | None = None
-    # Gaussians with a larger axis are pruned. None: none are.
-    max_scale: float | None = None
-    # Limit of the population after the event. None: no limit.
-    max_gaussians: int | None = None
+    max_screen_radius: float | None = None  # pixels, since the last event; larger ones are pruned
+    max_scale: float | None = None  # Gaussians with a larger axis are pruned; None: none are
+    max_gaussians: int | None = None  # limit of the population after the event; None: no limit
     # A Gaussian is judged when it has at least this many gradients; with fewer, its statistics are kept for
     # the next event. A mean of few gradients is noisy, and the largest of many noisy means would make
     # Gaussians without need.
@@ -75,12 +71,10 @@ def densify(
     seed: int,
     level_count: int,  # number of octree levels K; levels of children stay below it
     ranks: Ranks,  # the job, whose tables together are the population; every rank calls this
-    # extent of the scene, in the unit of the means; only used for the candidates' features
-    extent: float = 1.0,
+    extent: float = 1.0,  # of the scene, in the unit of the means, for the candidates' features
     veto: Veto | None = None,  # returns which candidates are withheld; None: none are
     lineage: Lineage | None = None,  # logs births and deaths, or None
-    # the table's pending steps, of which the candidates take theirs; None: there are none
-    pending: Pending | None = None,
+    pending: Pending | None = None,  # pending steps of the table, which candidates take; None: none
 ) -> DensityReport:
     """Run one density event, and reset the statistics that it used.
 
@@ -151,8 +145,6 @@ def cap_opacities(table: GaussianTable, opacity: float) -> None:
     """Cap the opacities of all rows and set the moments of all opacities to zero; no step may be pending.
 
     This is the opacity reset of 3DGS (Kerbl et al. 2023, section 5.2).
-
-    `table`: changed in place. `opacity`: the cap, in (0, 1).
     """
     table["opacities"].clamp_(max=opacity_logit(opacity))
     table["exp_avg.opacities"].zero_()

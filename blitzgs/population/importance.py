@@ -89,10 +89,8 @@ def sweep(
     ranks: Ranks,
     owners: TileOwners | None = None,  # divides the tiles by their costs; the result does not depend on it
     rule: ScoreRule = "density",  # of the score
-    # leaves Gaussians out of views as rendering does; there they contribute nothing and hide nothing
-    lod: ModelGate | None = None,
-    # whether to give up, asked before each batch but the first; the same answer on every rank
-    stops: Callable[[], bool] | None = None,
+    lod: ModelGate | None = None,  # leaves Gaussians out of views, where they hide nothing either
+    stops: Callable[[], bool] | None = None,  # asked before a batch; the same on every rank
 ) -> Importance:
     """Score the Gaussians by their contributions to V views. Collective: every rank calls it.
 
@@ -241,10 +239,8 @@ def sample_by_score(
 def top_by_score(
     score: Tensor,  # float32 [N_rank], finite, >= 0
     ids: Tensor,  # int64 [N_rank], persistent; they decide between equal scores
-    # the prefix is the shortest that holds this share of the total score of all ranks, in [0, 1]
-    mass: float,
-    # the prefix has at most floor(keep N) of all ranks' N Gaussians; in [0, 1], its decimal value counts
-    keep: float,
+    mass: float,  # the shortest prefix that holds this share of the score of all ranks, in [0, 1]
+    keep: float,  # but at most floor(keep N) of all ranks' N Gaussians; its decimal value counts
     ranks: Ranks,  # the job; every rank calls this
 ) -> Tensor:
     """Choose what pass 2 keeps, bool [N_rank], the same ids at any world size: the best by score."""

@@ -64,8 +64,7 @@ def octree_gaussians(
     colors: Tensor,  # their colours, uint8 [M, 3]
     centres: Tensor,  # camera centres, float64 [V, 3]
     levels: Levels,  # from `measure_levels` on the same points and cameras
-    # a voxel is kept when its level is resolvable in more than this share of the cameras
-    visible_threshold: float,
+    visible_threshold: float,  # a voxel's level is resolvable in more than this share of cameras
     # largest number of Gaussians. Whole levels are kept, from the coarsest on, and of the first level that
     # does not fit a random part. 0: no limit.
     most: int = 0,

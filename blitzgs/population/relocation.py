@@ -46,12 +46,10 @@ def relocate(
     step: int,  # the latest optimiser step; new rows are current up to it
     seed: int,
     ranks: Ranks,  # the job, whose tables together are the population; every rank calls this
-    # extent of the scene, in the unit of the means; only used for the lineage's features
-    extent: float = 1.0,
+    extent: float = 1.0,  # of the scene, in the unit of the means, for the lineage's features
     level_count: int = 1,  # number of octree levels; only used for the lineage's features
     lineage: Lineage | None = None,  # logs births and deaths, or None
-    # the table's pending steps, of which the copied Gaussians take theirs; None: there are none
-    pending: Pending | None = None,
+    pending: Pending | None = None,  # pending steps of the table, which sources take; None: none
 ) -> DensityReport:
     """Replace dead Gaussians by copies of live ones, and let the population grow.
 

@@ -85,8 +85,8 @@ def _without_far(points: Tensor) -> Tensor:
 class BlockIndex:
     """Bounds of blocks of 256 consecutive rows of one table, updated as an optimiser moves rows.
 
-    Build a new index whenever rows were added, removed or reordered. Sort the table by `morton_order` first:
-    the active set is right in any order, but in a random order blocks are large and no block is skipped.
+    Build a new one whenever rows were added, removed or reordered. The active set is right in any order, but
+    without `morton_order` blocks are large and none is skipped.
     """
 
     def __init__(self, table: GaussianTable, pending_table: Tensor | None = None) -> None:
@@ -162,10 +162,8 @@ class Cameras(NamedTuple):
     viewmats: Tensor  # float32 [V, 4, 4], world to camera
     Ks: Tensor  # float32 [V, 3, 3], pixels
     sizes: Tensor  # int32 [V, 2], width and height, pixels
-    # Near plane, far plane and eps2d, as `blitzgs.ops.blocks.cull_blocks` has them.
-    limits: tuple[float, float, float]
-    # The views' columns in the cull matrix, int64 [V]; None: the views have no mask.
-    columns: Tensor | None = None
+    limits: tuple[float, float, float]  # near plane, far plane and eps2d, as in `cull_blocks`
+    columns: Tensor | None = None  # their columns in the cull matrix, int64 [V]; None: no mask
 
 
 class BlockVisibility:

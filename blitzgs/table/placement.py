@@ -79,10 +79,9 @@ def _without_end(count: int, total: int, new: Tensor, free: Tensor) -> Placement
 def redistribute(table: GaussianTable, ranks: Ranks, max_imbalance: float = MAX_IMBALANCE) -> bool:
     """If the shards have become unequal, move the row at position p of the global order to rank p mod M.
 
-    Collective: every rank calls it. All columns are moved; each shard has its rows in the global order.
-
-    `table`: this rank's shard, changed in place. `max_imbalance`: nothing happens up to this ratio of the
-    largest to the smallest shard; 0: always redistribute. Returns whether rows were redistributed.
+    Collective. All columns are moved; each shard has its rows in the global order. `max_imbalance`: nothing
+    happens up to this ratio of the largest to the smallest shard; 0: always redistribute. Returns whether
+    rows moved.
     """
     if ranks.world_size == 1:
         return False

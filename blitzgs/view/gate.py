@@ -37,8 +37,7 @@ class LodGate:
     fork: float  # f, ratio of neighbouring levels
     count: int  # number of levels K
     finest: int  # the finest level that views keep, L_max in 0..K - 1
-    # Opacities fade out over half a level, centred at these distances, instead of being cut off.
-    smooth: bool = False
+    smooth: bool = False  # opacities fade out over half a level instead of being cut off
 
     def reach(self) -> list[float]:
         """Return for each of the K levels the distance up to which views keep it; -1: no view keeps it."""

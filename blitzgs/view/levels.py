@@ -147,8 +147,7 @@ def _values_needed(count: int, q: float) -> int:
 def _quantile(values: Tensor, q: float, count: int | None = None) -> Tensor:
     """Return the linearly interpolated quantile of values near one of their ends, without a full sort.
 
-    `values`: [..., M], or as many of them as include `_values_needed`. `q`: quantile. `count`: M; None:
-    `values` has all.
+    `values`: [..., M], or as many as include `_values_needed`. `count`: M; None: `values` has all.
     """
     count = count or values.shape[-1]
     position = (1.0 - q if q > 0.5 else q) * (count - 1)

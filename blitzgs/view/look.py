@@ -27,8 +27,7 @@ class Look:
     # "RGB"; "depth", the expected depth in the capture's unit; "alpha", the opacity; "count", how many
     # entries of its tile's list a pixel goes through; "level", RGB with a colour for each octree level.
     mode: Mode = "RGB"
-    # Spherical-harmonics degree; None: the model's. At most the model's is used.
-    sh_degree: int | None = None
+    sh_degree: int | None = None  # of spherical harmonics; None, or a higher one: the model's
     background: tuple[float, float, float] | None = None  # RGB in [0, 1]; None: the model's
     lod: bool = True  # apply the model's LOD gate, if it has one
     smooth: bool | None = None  # fade the levels of the gate; None: as the model was trained

@@ -70,8 +70,7 @@ class Traffic(NamedTuple):
     splats: list[list[int]]  # splats[s][d] is the number of splats that rank s sends to rank d
     sent: list[int]  # number of splats sent to each rank
     received: list[int]  # number of splats received from each rank
-    # For each rank, the position of this rank's first splat among all that the rank receives.
-    starts: list[int]
+    starts: list[int]  # for each rank, the position of this rank's first splat in what that receives
     most: int  # largest number of splats that any rank has, sends or receives
     n_isects: int  # upper bound of the tile entries of the splats received
     most_isects: int  # largest `n_isects` of any rank
@@ -118,8 +117,7 @@ class Exchange(NamedTuple):
     """The exchange of one frame's splats: queued work, whose sizes the host may not know until `finish`."""
 
     projected: ProjectionOutputs  # this rank's own splats, with spare capacity if the host does not know more
-    # The splats that this rank composites; longer than their number if the host does not know it yet.
-    arrived: Splats
+    arrived: Splats  # splats to composite; too long while the host does not know their number
     n_splats: Tensor | None  # int64 [1], number of valid splats, on the device; None: all are valid
     n_isects: int  # upper bound of the tile entries, or capacity for them; -1: they must be counted
     # Memory, [R, 12], in which the gradients of these splats must be added up, because other ranks read them
