@@ -52,43 +52,40 @@ class Places(NamedTuple):
         """
         if torch.compiler.is_compiling():  # torch differentiates them, and tracing a Function is fragile
             return self._arranged_by_torch(columns, under)
-        if not torch.is_grad_enabled():
+
+        def run(under: Tensor | None, *columns: Tensor) -> tuple[Tensor, ...]:
             return tuple(torch.ops.blitzgs.arrange_splats(columns, self.indices, self.shape, under))
-        shape = self.shape
-        return linear_map(
-            lambda under, *columns: tuple(
-                torch.ops.blitzgs.arrange_splats(columns, self.indices, shape, under)
-            ),
-            lambda saved, needed, v: _gradients_of_arranged(Places(tuple(saved), shape), needed, v),
-            [under, *columns],
-            self.indices,
-        )
+
+        def back(needed: Sequence[bool], v: Sequence[Tensor | None]) -> list[Tensor | None]:
+            v_columns, v_under = _given(self.gather, v), None
+            v_last, v_of_splats = v[-1], v_columns[-1]
+            if needed[0] and v_last is not None and v_of_splats is not None:
+                # No two splats have the same place.
+                v_under = (v_last - self.arrange([v_of_splats])[0]).sum(dim=-2)
+            return [v_under, *v_columns]
+
+        return linear_map(run, back, [under, *columns]) if torch.is_grad_enabled() else run(under, *columns)
 
     def gather(self, arranged: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Return the columns of the splats, [P, ...], of arranged ones, [*shape, ...]."""
         if torch.compiler.is_compiling():
             places, first = self.flat(), len(self.shape)
             return tuple(t.reshape(-1, *t.shape[first:]).index_select(0, places) for t in arranged)
-        if not torch.is_grad_enabled():
+
+        def run(*arranged: Tensor) -> tuple[Tensor, ...]:
             return tuple(torch.ops.blitzgs.splats_of_arranged(arranged, self.indices, self.shape))
-        shape = self.shape
-        return linear_map(
-            lambda *arranged: tuple(torch.ops.blitzgs.splats_of_arranged(arranged, self.indices, shape)),
-            lambda saved, _, v: _given(Places(tuple(saved), shape).arrange, v),
-            arranged,
-            self.indices,
-        )
+
+        if not torch.is_grad_enabled():
+            return run(*arranged)
+        return linear_map(run, lambda _, v: _given(self.arrange, v), arranged)
 
     def _arranged_by_torch(self, columns: Sequence[Tensor], under: Tensor | None) -> tuple[Tensor, ...]:
-        places, found = self.flat(), []
-        for i, column in enumerate(columns):
-            over = under is not None and i == len(columns) - 1
-            arranged = column.new_zeros(*self.shape, *column.shape[1:])
-            if over:
-                assert under is not None
-                arranged = under[..., None, :].expand(self.shape).clone(memory_format=torch.contiguous_format)
+        places = self.flat()
+        found = [column.new_zeros(*self.shape, *column.shape[1:]) for column in columns]
+        if under is not None:
+            found[-1] = under[..., None, :].expand(self.shape).clone(memory_format=torch.contiguous_format)
+        for arranged, column in zip(found, columns, strict=True):
             arranged.view(-1, *column.shape[1:]).index_copy_(0, places, column)
-            found.append(arranged)
         return tuple(found)
 
 
@@ -101,17 +98,6 @@ def _given(
     return [None if column is None else next(found) for column in columns]
 
 
-def _gradients_of_arranged(
-    places: Places, needed: Sequence[bool], v_arranged: Sequence[Tensor | None]
-) -> list[Tensor | None]:
-    """Return the gradients of `under` and of the columns; no two splats have the same place."""
-    v_under, v_columns = None, _given(places.gather, v_arranged)
-    v_last, v_of_splats = v_arranged[-1], v_columns[-1]
-    if needed[0] and v_last is not None and v_of_splats is not None:
-        v_under = (v_last - places.arrange([v_of_splats])[0]).sum(dim=-2)
-    return [v_under, *v_columns]
-
-
 class Layout:
     """The arrangement of P splats in `meta`: the visible ones if `packed`, or else all of all views.
 
@@ -119,14 +105,13 @@ class Layout:
     """
 
     def __init__(
-        self, splats: ProjectedSplats, shape: tuple[int, ...], packed: bool, under: Tensor | None
+        self,
+        splats: ProjectedSplats,  # camera_ids number all images, gaussian_ids the Gaussians of a scene
+        shape: tuple[int, ...],  # batch dimensions, C, and the Gaussians N of a scene
+        packed: bool,
+        under: Tensor | None,  # opacities of Gaussians without a splat, [..., N]; None: zero
     ) -> None:
-        """Compute the arrangement.
-
-        `splats`: their camera_ids number all images of the call, their gaussian_ids the Gaussians of a scene.
-        `shape`: batch dimensions, C, and the Gaussians N of a scene. `under`: opacities of the Gaussians,
-        [..., N], where they have no splat; None: zero.
-        """
+        """Compute the arrangement."""
         self.splats, self.packed = splats, packed
         self.places: Places | None = None  # of each splat in `meta`; None: the order is unchanged
         if not packed:

@@ -97,7 +97,7 @@ def send_splats(
 def _sent(table: Tensor, sent: list[int], received: list[int], ranks: Ranks) -> Tensor:
     """Send rows to other ranks; the backward pass sends their gradients back."""
 
-    def returned(_saved: Any, _needed: Any, v: Sequence[Tensor | None]) -> list[Tensor]:
+    def returned(_needed: Any, v: Sequence[Tensor | None]) -> list[Tensor]:
         # Every rank sends, also one whose rows have no gradient.
         rows = table.new_zeros(sum(received), table.shape[1]) if v[0] is None else v[0]
         return [ranks.all_to_all(rows, received, sent)]
@@ -109,7 +109,7 @@ def _sent(table: Tensor, sent: list[int], received: list[int], ranks: Ranks) -> 
 def _all_poses(viewmats: Tensor, ranks: Ranks) -> Tensor:
     """Gather the poses of all ranks; the gradient of a pose is the sum over all ranks."""
 
-    def summed(_saved: Any, _needed: Any, v: Sequence[Tensor | None]) -> list[Tensor]:
+    def summed(_needed: Any, v: Sequence[Tensor | None]) -> list[Tensor]:
         total = v[0].contiguous().clone() if v[0] is not None else viewmats.new_zeros(shape)
         return [ranks.all_reduce(total)[ranks.rank * len(viewmats) :][: len(viewmats)]]
 

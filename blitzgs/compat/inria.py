@@ -319,10 +319,7 @@ def _with_gradients_of(
     """
     shapes = [None if tensor is None else tensor.shape for tensor in screen]
 
-    def back(
-        saved: Sequence[Tensor], needed: Sequence[bool], v: Sequence[Tensor | None]
-    ) -> list[Tensor | None]:
-        ids, half = saved
+    def back(needed: Sequence[bool], v: Sequence[Tensor | None]) -> list[Tensor | None]:
         v_means2d = torch.zeros_like(means2d) if v[0] is None else v[0]
         found = (v_means2d, absolute.pop() if absolute else v_means2d.abs())
 
@@ -337,5 +334,5 @@ def _with_gradients_of(
 
         return [v_means2d, *first_only("GaussianRasterizer", spread, [v_means2d])]
 
-    (passed,) = linear_map(lambda means2d, *_: (means2d.clone(),), back, [means2d, *screen], [ids, half])
+    (passed,) = linear_map(lambda means2d, *_: (means2d.clone(),), back, [means2d, *screen])
     return passed

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from blitzgs._torch import mark_coalesced, raw_indices, raw_values, refusing_derivatives
 
-# Maps saved tensors, which inputs need a gradient, and the gradients of the outputs to those of the inputs.
-Adjoint = Callable[[Sequence[Tensor], Sequence[bool], Sequence[Tensor | None]], Sequence[Tensor | None]]
+# Maps which inputs need a gradient, and the gradients of the outputs, to those of the inputs.
+Adjoint = Callable[[Sequence[bool], Sequence[Tensor | None]], Sequence[Tensor | None]]
 
 
 def first_only(
@@ -56,10 +56,9 @@ def linear_map(
     forward: Callable[..., tuple[Tensor, ...]],
     adjoint: Adjoint,
     inputs: Sequence[Tensor | None],
-    saved: Sequence[Tensor] = (),  # tensors without gradients for `adjoint`
 ) -> tuple[Tensor, ...]:
     """Apply a linear map, of which autograd records nothing, with the gradient that its adjoint gives."""
-    outputs: tuple[Tensor, ...] = _LinearMap.apply(forward, adjoint, saved, *inputs)  # type: ignore[no-untyped-call]
+    outputs: tuple[Tensor, ...] = _LinearMap.apply(forward, adjoint, *inputs)  # type: ignore[no-untyped-call]
     return outputs
 
 
@@ -71,17 +70,15 @@ class _LinearMap(torch.autograd.Function):
         ctx: Any,
         forward: Callable[..., tuple[Tensor, ...]],
         adjoint: Adjoint,
-        saved: Sequence[Tensor],
         *inputs: Tensor | None,
     ) -> tuple[Tensor, ...]:
         ctx.adjoint = adjoint
-        ctx.save_for_backward(*saved)
         ctx.set_materialize_grads(False)
         return forward(*inputs)
 
     @staticmethod
     def backward(ctx: Any, *v_outputs: Tensor | None) -> Any:
-        return None, None, None, *ctx.adjoint(ctx.saved_tensors, ctx.needs_input_grad[3:], v_outputs)
+        return None, None, *ctx.adjoint(ctx.needs_input_grad[2:], v_outputs)
 
 
 def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
@@ -128,7 +125,7 @@ def rows_of_tables(
         rows = [table.index_select(0, ids) for table in tables]
         return (*rows[:4], *([torch.cat(rows[4:], dim=1)] if lengths else []))
 
-    def spread(_saved: Any, needed: Sequence[bool], v: Sequence[Tensor | None]) -> list[Tensor | None]:
+    def spread(needed: Sequence[bool], v: Sequence[Tensor | None]) -> list[Tensor | None]:
         gradients = list(v)
         if len(lengths) > 1 and v[4] is not None:
             # Autograd would copy a gradient that is not contiguous, and its indices with it. Torch adds to an
@@ -153,7 +150,7 @@ def distinct_rows(table: Tensor) -> tuple[Tensor, Tensor]:
 def of_shape(table: Tensor, shape: Sequence[int]) -> Tensor:
     """Return a table [N, ...] with rows of another shape, (N, ...), whose gradient may be sparse."""
 
-    def back(_saved: Any, _needed: Any, v: Sequence[Tensor | None]) -> list[Tensor | None]:
+    def back(_needed: Any, v: Sequence[Tensor | None]) -> list[Tensor | None]:
         if v[0] is None or not v[0].is_sparse:
             return [None if v[0] is None else v[0].reshape(table.shape)]
         values = raw_values(v[0])
