@@ -83,15 +83,12 @@ def send_splats(
     columns = (splats.means2d, splats.conics, splats.opacities[:, None], splats.depths[:, None], channels)
     table = torch.cat(columns, dim=1).index_select(0, order)
     arrived = _sent(table, *sizes, ranks)
-    means2d, conics, opacities, depths, own_channels = arrived.split(widths, dim=1)
+    means2d, conics, opacities, depths, own_channels = (
+        column.contiguous() for column in arrived.split(widths, dim=1)
+    )
     own_views = ranks.all_to_all((images % views).index_select(0, order), *sizes).int()
-    return splats._replace(
-        camera_ids=own_views,
-        means2d=means2d.contiguous(),
-        conics=conics.contiguous(),
-        opacities=opacities[:, 0].contiguous(),
-        depths=depths[:, 0].contiguous(),
-    ), own_channels.contiguous()
+    own = {"means2d": means2d, "conics": conics, "opacities": opacities[:, 0], "depths": depths[:, 0]}
+    return splats._replace(camera_ids=own_views, **own), own_channels
 
 
 def _sent(table: Tensor, sent: list[int], received: list[int], ranks: Ranks) -> Tensor:

@@ -97,14 +97,14 @@ def full_gradients(
 ) -> list[Tensor | None]:
     """Return the gradients of parameters from those of their rows `ids` [U], each once; None: not needed."""
     ids = ids.long()
-    return [
-        None
-        if gradient is None
-        else sparse_rows(ids, gradient, shape)
-        if is_sparse
-        else gradient.new_zeros(shape).index_copy_(0, ids, gradient)
-        for gradient, shape, is_sparse in zip(gradients, shapes, sparse, strict=True)
-    ]
+
+    def full(gradient: Tensor, shape: torch.Size, is_sparse: bool) -> Tensor:
+        if is_sparse:
+            return sparse_rows(ids, gradient, shape)
+        return gradient.new_zeros(shape).index_copy_(0, ids, gradient)
+
+    every = zip(gradients, shapes, sparse, strict=True)
+    return [None if v is None else full(v, shape, is_sparse) for v, shape, is_sparse in every]
 
 
 def rows_of_tables(

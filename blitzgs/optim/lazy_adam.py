@@ -301,11 +301,8 @@ class LazyAdam(torch.optim.Optimizer):
 
     def _select(self, rows: Tensor) -> dict[str, Parameter]:
         """Make the parameters of some of their rows, int64 [N']."""
-        return self._renew(
-            groups_by_name(self.param_groups),
-            lambda _, old: old.index_select(0, rows),
-            lambda old: old.index_select(0, rows),
-        )
+        named = groups_by_name(self.param_groups)
+        return self._renew(named, lambda _, old: old[rows], lambda old: old[rows])
 
     @torch.no_grad()
     def _renew(

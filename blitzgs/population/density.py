@@ -123,13 +123,8 @@ def densify(
         died = torch.nonzero_static(causes, size=n_died).squeeze(1)
         lineage.died(torch.cat((table["id"], new["id"]))[died], causes[died], time, step)
     grown = len(clones) + len(splits)
-    report = DensityReport(
-        cloned=len(clones),
-        split=len(splits),
-        pruned=grown + len(gone) - len(born),
-        held_back=int(wanted) - grown - vetoed,
-        vetoed=vetoed,
-    )
+    pruned, held_back = grown + len(gone) - len(born), int(wanted) - grown - vetoed
+    report = DensityReport(len(clones), len(splits), pruned, held_back, vetoed)
     if len(born) < len(parents):
         parents, new = parents[born], {name: column[born] for name, column in new.items()}
     table.replace(place(len(table), gone, parents, new["means"]), new, most_rows(rules, ranks))
@@ -176,16 +171,10 @@ def new_rows(table: GaussianTable, rows: Tensor, slots: Tensor, time: int, step:
     """Return copies of the rows `rows` as new Gaussians, born in the slots of `child_ids`."""
     names, parents = (*PARAMETERS, "level"), table["id"][rows]
     new = dict(zip(names, take_rows([table[name] for name in names], rows), strict=True))
-    return (
-        new
-        | table.inherited(rows)
-        | {
-            "id": child_ids(parents, time, slots),
-            "parent": parents,
-            "birth": torch.full_like(rows, time, dtype=torch.int32),
-            "last_step": torch.full_like(rows, step, dtype=torch.int32),
-        }
-    )
+    own = {"id": child_ids(parents, time, slots), "parent": parents}
+    dates = {"birth": time, "last_step": step}
+    own |= {name: torch.full_like(rows, date, dtype=torch.int32) for name, date in dates.items()}
+    return new | table.inherited(rows) | own
 
 
 def _shrink(children: dict[str, Tensor], seed: int, time: int) -> None:

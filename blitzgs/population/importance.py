@@ -178,12 +178,9 @@ class _Sums:
         self._rule = rule
         # Terms are integers in a unit for which the sum over all views fits into 62 bits.
         self._unit = 2.0 ** -min(48, 62 - n_views.bit_length() - _TERM_BITS[rule])
-        self._sums = ViewSums(
-            torch.zeros(count, dtype=torch.int64, device=device),
-            torch.zeros(count, dtype=torch.int32, device=device),
-            torch.zeros(count, dtype=torch.int32, device=device),
-            _all_culled(n_views, device).repeat(count, 1),
-        )
+        dtypes = (torch.int64, torch.int32, torch.int32)
+        score, seen, counted = (torch.zeros(count, dtype=dtype, device=device) for dtype in dtypes)
+        self._sums = ViewSums(score, seen, counted, _all_culled(n_views, device).repeat(count, 1))
 
     def add(self, found: Survey, columns: Sequence[int], surveyed: VisibleRows, ranks: Ranks) -> None:
         """Add the splats of a batch of views."""
@@ -192,12 +189,8 @@ class _Sums:
             found.weights, splats.camera_ids, splats.gaussian_ids, ids, VIEW_MASS, ranks, len(columns)
         )
         home = self._sums.score.device  # where the whole table is
-        lists = (
-            surveyed.rows_of(splats.visible_ids).to(home),
-            splats.splat_offsets.to(home),
-            splats.camera_ids.to(home),
-            splats.radii.to(home),
-        )
+        rows, offsets = surveyed.rows_of(splats.visible_ids).to(home), splats.splat_offsets.to(home)
+        lists = rows, offsets, splats.camera_ids.to(home), splats.radii.to(home)
         # The rule "energy" adds up the squares as the rule "weight" adds up the weights, without a divisor.
         terms, rule = (found.weights, self._rule) if found.squares is None else (found.squares, "weight")
         view_sums_(

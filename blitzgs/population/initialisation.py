@@ -46,17 +46,15 @@ class FirstGaussians:
         means = self.means[part].to(device)
         sh = torch.zeros(len(means), (sh_degree + 1) ** 2, 3, device=device)
         sh[:, 0] = self.colors[part].to(device)
-        return GaussianTable.create(
-            {
-                "means": means,
-                "quats": torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).repeat(len(means), 1),
-                "scales": self.log_scales[part].to(device)[:, None].repeat(1, 3),
-                "opacities": torch.full((len(means),), opacity_logit(opacity), device=device),
-                "sh": sh,
-                "level": self.levels[part].to(device),
-                "id": torch.arange(len(self))[part].to(device),
-            }
-        )
+        rows = {
+            "means": means,
+            "quats": torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).repeat(len(means), 1),
+            "scales": self.log_scales[part].to(device)[:, None].repeat(1, 3),
+            "opacities": torch.full((len(means),), opacity_logit(opacity), device=device),
+            "sh": sh,
+        }
+        level, ids = self.levels[part].to(device), torch.arange(len(self))[part].to(device)
+        return GaussianTable.create({**rows, "level": level, "id": ids})
 
 
 def octree_gaussians(

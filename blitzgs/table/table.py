@@ -73,32 +73,25 @@ class Placement(NamedTuple):
 
 
 def schema(sh_degree: int) -> dict[str, Column]:
-    """Return the columns of a table, in their order.
-
-    `sh_degree`: highest spherical-harmonics degree D; `sh` has K = (D + 1)^2 coefficients. Returns means [3],
-    quats [4], scales [3] (log), opacities [] (logit), sh [K, 3] as float32, their Adam moments `exp_avg.*`
-    and `exp_avg_sq.*`; last_step and moment_step int32 (the optimiser step up to which the row's parameters,
-    and its moments, are current); id int64 (persistent, unique over ranks), parent int64 (-1: none), birth
-    int32 (images seen when it was born), level uint8 (octree level); grad_sum float32, grad_count int32,
-    max_radii float32 (pixels): density statistics since the last density event.
-    """
-    f = torch.float32
+    """Return the columns of a table, in their order; `sh_degree`: the highest, of (D + 1)^2 coefficients."""
+    f, i = torch.float32, torch.int32
+    # Scales are logarithms, opacities logits.
     rows = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": ((sh_degree + 1) ** 2, 3)}
     columns = {name: Column(f, shape) for name, shape in rows.items()}
-    for prefix in ("exp_avg", "exp_avg_sq"):
+    for prefix in ("exp_avg", "exp_avg_sq"):  # Adam's moments
         columns |= {f"{prefix}.{name}": Column(f, shape) for name, shape in rows.items()}
-    columns |= {
-        "last_step": Column(torch.int32, ()),
-        "moment_step": Column(torch.int32, ()),
-        "id": Column(torch.int64, ()),
-        "parent": Column(torch.int64, ()),
-        "birth": Column(torch.int32, ()),
-        "level": Column(torch.uint8, ()),
-        "grad_sum": Column(f, ()),
-        "grad_count": Column(torch.int32, ()),
-        "max_radii": Column(f, ()),
+    scalars = {
+        "last_step": i,  # optimiser step up to which the row's parameters are current
+        "moment_step": i,  # the same of its moments
+        "id": torch.int64,  # persistent, unique over ranks
+        "parent": torch.int64,  # an id; -1: none
+        "birth": i,  # images seen when it was born
+        "level": torch.uint8,  # octree level
+        "grad_sum": f,  # this and the next two: statistics since the last density event
+        "grad_count": i,
+        "max_radii": f,  # pixels
     }
-    return columns
+    return columns | {name: Column(dtype, ()) for name, dtype in scalars.items()}
 
 
 def opacity_logit(opacity: float) -> float:

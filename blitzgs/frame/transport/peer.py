@@ -63,15 +63,10 @@ from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, SplatGradients
 
 # The columns of `Splats` in the order in which ranks write them (kSentColumns of csrc/exchange/transport.h):
 # dtype, words and shape of an element.
-_COLUMNS = (
-    (torch.float32, 2, (2,)),
-    (torch.float32, 3, (3,)),
-    (torch.float32, 1, ()),
-    (torch.float32, 3, (3,)),
-    (torch.float32, 1, ()),
-    (torch.int32, 1, ()),
-    (torch.int64, 2, ()),
-)
+_COLUMNS: tuple[tuple[torch.dtype, int, tuple[int, ...]], ...] = (
+    (torch.float32, 2, (2,)), (torch.float32, 3, (3,)), (torch.float32, 1, ()), (torch.float32, 3, (3,)),
+    (torch.float32, 1, ()), (torch.int32, 1, ()), (torch.int64, 2, ()),
+)  # fmt: skip
 _SPLAT_WORDS = sum(words for _, words, _ in _COLUMNS)
 WORDS_PER_SPLAT = _SPLAT_WORDS + SPLAT_GRADIENT
 # Buffers hold a multiple of this many splats, so that every column begins at a full memory transaction.

@@ -220,12 +220,8 @@ class CapacityEstimate:
         with self._lock:
             before = self.sizes or Sizes(0, 0, 0)
             # Views differ, so the estimate exceeds the largest recent size, and it shrinks slowly.
-            self.sizes = Sizes(
-                *[
-                    max(1, n * 9 // 8, size - size // 256)
-                    for n, size in zip(Sizes(*needed), before, strict=True)
-                ]
-            )
+            both = zip(Sizes(*needed), before, strict=True)
+            self.sizes = Sizes(*[max(1, n * 9 // 8, size - size // 256) for n, size in both])
 
 
 class LocalTransport:
