@@ -39,7 +39,7 @@ from blitzgs.ops.projection_types import (
     Splats,
     Views,
 )
-from blitzgs.ops.splat_gradients import GradientBuffer, RasterizeSaved, SplatGradients
+from blitzgs.ops.rasterize import GradientBuffer, RasterizeSaved, SplatGradients
 from blitzgs.table.table import GaussianTable
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from blitzgs._library import below_autograd
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
-from blitzgs.ops.splat_gradients import SplatGradients
+from blitzgs.ops.rasterize import SplatGradients
 
 # Columns of the schedule's table, as in csrc/adam/lazy_adam.h: tails of 4 orders for 6 groups, powers of
 # the decay rates, bias corrections.

@@ -20,7 +20,7 @@ from blitzgs.ops.projection_types import (
     Sizes,
     splats_of,
 )
-from blitzgs.ops.splat_gradients import gradient_table_of
+from blitzgs.ops.rasterize import gradient_table_of
 
 # The columns of `ProjectedSplats` that have gradients: means2d, conics, depths, opacities, colors.
 _LEARNED = slice(4, 9)

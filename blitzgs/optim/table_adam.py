@@ -13,7 +13,7 @@ from blitzgs.config.schedule import Schedule
 from blitzgs.frame.render import Frame
 from blitzgs.ops.blocks import put_rows_, take_rows
 from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_, project_bwd_step_
-from blitzgs.ops.splat_gradients import SplatGradients
+from blitzgs.ops.rasterize import SplatGradients
 from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 
 # Adam's constants for one view a step.

@@ -14,7 +14,7 @@ from blitzgs.ops.exchange import place_runs
 from blitzgs.ops.host import HostCopy, PinnedNumbers, current_stream
 from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.ops.projection_types import VIEW_TOTALS, Sizes, splats_of
-from blitzgs.ops.splat_gradients import SPLAT_GRADIENT
+from blitzgs.ops.rasterize import SPLAT_GRADIENT
 from tests.cuda.conftest import Scene, ops
 
 SIZES = (3000, 40, 30_000, 700)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from blitzgs.ops.projection_types import VIEW_TOTALS, Sizes, splats_of
-from blitzgs.ops.splat_gradients import RasterizeSaved
+from blitzgs.ops.rasterize import RasterizeSaved
 from tests.cuda.conftest import Scene, ops, relative_error
 from tests.ops.splats import kept_by
 

@@ -11,7 +11,7 @@ from blitzgs.frame.render import backward_splats, render_frame, tile_grid
 from blitzgs.frame.transport.protocol import CapacityEstimate, LocalTransport, stages_told_to
 from blitzgs.ops import project, splat_gradients
 from blitzgs.ops.projection_types import Sizes
-from blitzgs.ops.splat_gradients import gradient_columns
+from blitzgs.ops.rasterize import gradient_columns
 from blitzgs.table.blocks import BlockIndex, morton_order
 from blitzgs.table.table import GaussianTable
 from tests.cuda.conftest import ops

@@ -17,7 +17,7 @@ from blitzgs.ops.exchange import scatter_splats
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Sizes
-from blitzgs.ops.splat_gradients import SplatGradients
+from blitzgs.ops.rasterize import SplatGradients
 from tests.distributed.rank_harness import run_ranks
 from tests.frame.test_sharded_rendering import OPTIONS, cameras
 from tests.frame.without_gpu import Host, Memory, replace_cuda

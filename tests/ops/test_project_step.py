@@ -13,7 +13,7 @@ from blitzgs.ops.lazy_adam import (
 )
 from blitzgs.ops.project import project
 from blitzgs.ops.projection_types import ProjectionOptions
-from blitzgs.ops.splat_gradients import SplatGradients
+from blitzgs.ops.rasterize import SplatGradients
 from tests.helpers import refused
 
 BETA1, BETA2, EPS = 0.9**2, 0.999**2, 1e-15 / math.sqrt(2)

@@ -59,7 +59,7 @@ from blitzgs.frame.transport.protocol import (
 from blitzgs.ops.exchange import place_runs
 from blitzgs.ops.host import current_stream
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats, splats_of
-from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, SplatGradients
+from blitzgs.ops.rasterize import SPLAT_GRADIENT, SplatGradients
 
 # The columns of `Splats` in the order in which ranks write them (kSentColumns of csrc/exchange/transport.h):
 # dtype, words and shape of an element.

@@ -40,7 +40,7 @@ from blitzgs.ops.projection_types import (
 if TYPE_CHECKING:
     from blitzgs.distributed.group import Ranks
     from blitzgs.frame.tiles import TileAssignment
-    from blitzgs.ops.splat_gradients import SplatGradients
+    from blitzgs.ops.rasterize import SplatGradients
 
 
 _listener: Callable[[str], object] | None = None
