@@ -70,6 +70,13 @@ class Scene(NamedTuple):
     lenses: Lenses | None = None  # lenses and shutters of the views; None: pinhole cameras
 
 
+# The tensors of a scene: the first dimension, and the others.
+_SHAPES = (
+    ("means", "N", (3,)), ("quats", "N", (4,)), ("scales", "N", (3,)), ("opacities", "N", ()),
+    ("viewmats", "C", (4, 4)), ("Ks", "C", (3, 3)),
+)  # fmt: skip
+
+
 class Gaussians(NamedTuple):
     """The checked arguments of a call: S scenes of N Gaussians and C views each, I = S C images."""
 
@@ -204,24 +211,14 @@ def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]
 
 
 def gaussians_of(
-    function: str,
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor | None,
-    viewmats: Tensor,
-    Ks: Tensor,
+    function: str,  # name of the public function
+    whole: Scene,  # its arguments, with all batch dimensions
     sh_degree: int | None,
-    render_mode: str,
-    raw: bool = False,
+    render_mode: str,  # without "RGB", colours are not rendered
+    raw: bool = False,  # whether scales and opacities are before their activation
 ) -> Gaussians:
-    """Check shapes and fold the batch dimensions into one (ValueError: a shape that does not fit, by name).
-
-    The arguments are those of `blitzgs.rasterization`, but for the name of the public `function`; and `raw`,
-    whether scales and opacities are before their activation. Without "RGB" in `render_mode`, colours are not
-    rendered.
-    """
+    """Check shapes and fold the batch dimensions into one (ValueError: a wrong shape, by name)."""
+    means, _, _, opacities, colors, viewmats, Ks, *_ = whole
     if Ks.requires_grad and torch.is_grad_enabled() and not torch.compiler.is_compiling():
         warn_of_gradient(function)
     if means.dim() < 2 or viewmats.dim() < 3:
@@ -230,16 +227,10 @@ def gaussians_of(
             f"{list(viewmats.shape)}"
         )
     batch, N, C = tuple(means.shape[:-2]), means.shape[-2], viewmats.shape[-3]
-    for name, tensor, last, described in (
-        ("means", means, (N, 3), "N, 3"),
-        ("quats", quats, (N, 4), "N, 4"),
-        ("scales", scales, (N, 3), "N, 3"),
-        ("opacities", opacities, (N,), "N"),  # another shape might broadcast
-        ("viewmats", viewmats, (C, 4, 4), "C, 4, 4"),
-        ("Ks", Ks, (C, 3, 3), "C, 3, 3"),
-    ):
-        if tensor.shape != (*batch, *last):
-            refuse_shape(name, tensor, (*batch, *last), described)
+    for name, first, last in _SHAPES:  # another shape might broadcast
+        tensor, shape = getattr(whole, name), (*batch, N if first == "N" else C, *last)
+        if tensor.shape != shape:
+            refuse_shape(name, tensor, shape, ", ".join(map(str, (first, *last))))
     with_colors = "RGB" in render_mode
     if colors is None and with_colors:
         raise ValueError("colors may be None for the render modes D and ED alone")
@@ -258,7 +249,7 @@ def gaussians_of(
     ):
         colors = colors_of_views(degree, means, viewmats, colors, per_view)
         per_view, degree = True, None
-    whole = Scene(means, quats, scales, opacities, colors, viewmats, Ks)
+    whole = whole._replace(colors=colors)
     scenes = _scenes(whole, batch) if batch else (whole,)
     columns = zip(Scene._fields, zip(*scenes, strict=True), strict=True)
     named = {name: own for name, own in columns if own[0] is not None}

@@ -93,10 +93,7 @@ def with_lenses(
     rolling_shutter: Any,
     ut_params: Any,
     refused: Mapping[str, bool],  # unsupported arguments, by what to call them: are they given?
-    radial_coeffs: Tensor | None,
-    tangential_coeffs: Tensor | None,
-    thin_prism_coeffs: Tensor | None,
-    viewmats_rs: Tensor | None,
+    lens: Mapping[str, Tensor | None],  # radial_coeffs to viewmats_rs
 ) -> Gaussians:
     """Return Gaussians whose scenes have lenses; the arguments are those of `blitzgs.rasterization`.
 
@@ -110,13 +107,11 @@ def with_lenses(
             raise ValueError(f"with_ut does not support {name}; leave one of them out")
     fisheye = camera_model == "fisheye"
     given: dict[str, Tensor] = {}
-    for name, tensor, last in (
-        ("radial_coeffs", radial_coeffs, (4,) if fisheye else (6,)),
-        ("tangential_coeffs", tangential_coeffs, (2,)),
-        ("thin_prism_coeffs", thin_prism_coeffs, (4,)),
-        ("viewmats_rs", viewmats_rs, (4, 4)),
-    ):
-        if tensor is None:
+    for name, last in (
+        ("radial_coeffs", (4,) if fisheye else (6,)), ("tangential_coeffs", (2,)),
+        ("thin_prism_coeffs", (4,)), ("viewmats_rs", (4, 4)),
+    ):  # fmt: skip
+        if (tensor := lens[name]) is None:
             continue
         if tensor.shape != (*lead, *last):
             refuse_shape(name, tensor, (*lead, *last), ", ".join(map(str, ("C", *last))))
@@ -124,14 +119,14 @@ def with_lenses(
             raise ValueError(f"a fisheye has no {name}; leave it out")
         given[name] = tensor.detach().reshape(gaussians.images, *last)
     shutter = _shutter(rolling_shutter)
-    if (shutter == GLOBAL_SHUTTER) != (viewmats_rs is None):
+    if (shutter == GLOBAL_SHUTTER) != ("viewmats_rs" not in given):
         raise ValueError("a rolling shutter needs viewmats_rs, and a global one has none")
     lenses = first.new_zeros(gaussians.images, 13)
     lenses[:, 12] = math.inf
     for name, begin in (("radial_coeffs", 0), ("tangential_coeffs", 6), ("thin_prism_coeffs", 8)):
         if name in given:
             lenses[:, begin : begin + given[name].shape[1]] = given[name]
-    if fisheye and radial_coeffs is not None:
+    if fisheye and "radial_coeffs" in given:
         lenses[:, 12] = largest_angles(given["radial_coeffs"])
     whole = Lenses(lenses, given.get("viewmats_rs"), fisheye, shutter)
     if ut_params is not None:

@@ -12,6 +12,7 @@ from blitzgs.call.arguments import (
     CAMERA_MODELS,
     DEFAULT_TILE_SIZE,
     RENDER_MODES,
+    Scene,
     check_choice,
     check_further,
     check_tensors,
@@ -210,9 +211,8 @@ def rasterization(
         # Placeholders, which the decomposition of the covariances replaces.
         quats, scales = (means.new_zeros(()).expand(*means.shape[:-1], length) for length in (4, 3))
     assert quats is not None and scales is not None
-    gaussians = gaussians_of(
-        "rasterization", means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, render_mode
-    )
+    scene = Scene(means, quats, scales, opacities, colors, viewmats, Ks)
+    gaussians = gaussians_of("rasterization", scene, sh_degree, render_mode)
     if sparse_grad and len(gaussians.lead) > 1:
         raise ValueError("sparse_grad does not support batch dimensions; leave one of them out")
     if extra_signals is not None:
@@ -223,7 +223,7 @@ def rasterization(
         gaussians = with_covariances(gaussians, covars, sparse_grad, return_normals)
     if with_ut:
         refused = {"covars": covars is not None, "sparse_grad": sparse_grad, "distributed": distributed}
-        gaussians = with_lenses(gaussians, camera_model, rolling_shutter, ut_params, refused, **lens)
+        gaussians = with_lenses(gaussians, camera_model, rolling_shutter, ut_params, refused, lens)
     background = None
     if backgrounds is not None:
         background = background_rows(backgrounds, gaussians, render_mode, return_normals)

@@ -19,6 +19,7 @@ from blitzgs.call.arguments import (
     GSPLAT_DEFAULTS,
     KERNEL_SH_DEGREE,
     RENDER_MODES,
+    Scene,
     check_choice,
     check_further,
     check_tensors,
@@ -113,9 +114,8 @@ def raw_rasterization(
         tensors["sh0"] = sh0 = harmonics[0] = of_shape(sh0, (len(sh0), 1, 3))
     sh_degree = _checked_degree(harmonics, len(means), sh_degree, shaded)
     projection = projection._replace(sh_degree=sh_degree)
-    whole = gaussians_of(
-        "raw_rasterization", means, quats, scales, opacities, None, viewmats, Ks, None, "D", raw=True
-    )
+    scene = Scene(means, quats, scales, opacities, None, viewmats, Ks)
+    whole = gaussians_of("raw_rasterization", scene, None, "D", raw=True)
     if sparse_grad and torch.is_grad_enabled():
         _check_leaves(params | sh_params if shaded else params)
     given = {**tensors, "viewmats": viewmats, "Ks": Ks, "shN": shN}
