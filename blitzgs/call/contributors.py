@@ -116,9 +116,7 @@ def rasterize_num_contributing_gaussians(
         opacities: [nnz] or [..., N], `meta["opacities"]`.
         tile_offsets: `meta["isect_offsets"]`, [..., tile_height, tile_width].
         flatten_ids: `meta["flatten_ids"]`, [n_isects].
-        image_width: px.
-        image_height: px.
-        tile_size: `meta["tile_size"]`, px; 16 on CUDA.
+        image_width, image_height, tile_size: entries of `meta`, px; tiles are of 16 px on CUDA.
         pixels: [M, 2] (row, column) of the pixels to return; None: all.
         image_ids: [M], the image of each pixel; None: there is one image.
 

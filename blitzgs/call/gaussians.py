@@ -32,8 +32,7 @@ def quat_scale_to_covar_preci(
     Args:
         quats: [..., 4] (w, x, y, z), floating point, of any length but zero.
         scales: [..., 3] standard deviations, in world units.
-        compute_covar: whether the covariances are wanted.
-        compute_preci: whether the inverses are wanted; of a scale of 0, they are not finite.
+        compute_covar, compute_preci: whether covariances and inverses (infinite for scales of 0) are wanted.
         triu: whether to return (xx, xy, xz, yy, yz, zz), [..., 6].
 
     Returns:

@@ -147,13 +147,10 @@ class _Entries(NamedTuple):
         return getattr(self, key)()
 
     def batch_ids(self) -> Tensor | None:
-        images = self.layout.splats.camera_ids.long()
-        single = len(self.gaussians.scenes) == 1
-        return self._of_packed(torch.zeros_like(images) if single else images // self.gaussians.views)
+        return self._of_packed(self.layout.splats.camera_ids.long() // self.gaussians.views)
 
     def camera_ids(self) -> Tensor | None:
-        images = self.layout.splats.camera_ids.long()
-        return self._of_packed(images if len(self.gaussians.scenes) == 1 else images % self.gaussians.views)
+        return self._of_packed(self.layout.splats.camera_ids.long() % self.gaussians.views)
 
     def gaussian_ids(self) -> Tensor | None:
         return self._of_packed(self.layout.splats.gaussian_ids.long())
@@ -174,8 +171,17 @@ class _Entries(NamedTuple):
         return self.lists.grid.tiles[1]
 
     def isect_ids(self) -> Tensor:
-        splats = self.layout.splats if self.arrived is None else self.arrived
-        return _isect_ids(splats.depths, self.lists)
+        """Return gsplat's sort keys, int64: image | tile | float32 depth bits, from high to low."""
+        splats, grid = self.layout.splats if self.arrived is None else self.arrived, self.lists.grid
+        depths = splats.depths.detach().index_select(0, self.lists.listed())
+        entries = torch.arange(len(depths), device=depths.device)
+        keys = torch.searchsorted(self.lists.offsets[1:], entries, right=True)
+        if grid.n_cameras > 1:
+            # The bits of n_tiles. Its `bit_length()` would compile a graph for every number of tiles.
+            n_tiles = math.prod(grid.tiles)
+            tiles = torch.full((), n_tiles, dtype=torch.float64, device=depths.device)
+            keys = (keys // n_tiles << torch.frexp(tiles).exponent) | keys % n_tiles
+        return keys.bitwise_left_shift(32).bitwise_or(depths.float().view(torch.int32))
 
     def flatten_ids(self) -> Tensor:
         listed, places = self.lists.listed(), self.layout.places
@@ -188,16 +194,3 @@ class _Entries(NamedTuple):
 
     def non_finite(self) -> LateMapping:
         return LateMapping(lambda: non_finite(self.gaussians))
-
-
-def _isect_ids(depths: Tensor, lists: Lists) -> Tensor:
-    """Return gsplat's sort keys, int64: image | tile | float32 depth bits, from high to low."""
-    depths = depths.detach().index_select(0, lists.listed())
-    entries = torch.arange(len(depths), device=depths.device)
-    keys = torch.searchsorted(lists.offsets[1:], entries, right=True)
-    n_tiles = math.prod(lists.grid.tiles)
-    if lists.grid.n_cameras > 1:
-        # The bits of n_tiles. Its `bit_length()` would compile a graph for every number of tiles.
-        tiles = torch.full((), n_tiles, dtype=torch.float64, device=depths.device)
-        keys = (keys // n_tiles << torch.frexp(tiles).exponent) | keys % n_tiles
-    return keys.bitwise_left_shift(32).bitwise_or(depths.float().view(torch.int32))

@@ -96,10 +96,8 @@ def rasterization(
         viewmats: [..., C, 4, 4] world to camera, a rotation and a translation.
         Ks: [..., C, 3, 3] intrinsics in px, without skew and with a last row 0, 0, 1. They get no
             gradient. Others are refused; under `torch.compile` nothing is rendered with them.
-        width: image width in px.
-        height: image height in px.
-        near_plane: Gaussians have z > near_plane, world units; less than far_plane.
-        far_plane: Gaussians have z <= far_plane, world units.
+        width, height: size of the images in px.
+        near_plane, far_plane: Gaussians have near_plane < z <= far_plane, world units.
         radius_clip: drop splats whose radii in meta are both at most this, px, at least 0.
         eps2d: variance added to both screen axes, px^2, at least 0.
         sh_degree: degree to evaluate, 0 to 4; None when `colors` holds values.
@@ -118,14 +116,14 @@ def rasterization(
             absolute pixel gradients.
         rasterize_mode: "classic" or "antialiased". The factor on the opacity has no lower limit, as in gsplat
             1.5.3; gsplat's main branch limits it to 0.005, so that tiny Gaussians do not vanish.
-        channel_chunk: accepted and not needed: all channels are rendered in one pass.
+        channel_chunk, segmented: accepted and not needed: all channels are rendered in one pass, and gsplat's
+            sort never changes the result.
         distributed: whether Gaussians and views are divided among the ranks of the process group. Each rank
             passes its own Gaussians and views, the same number of views as the others, and gets the images of
             its own views, which show the Gaussians of all ranks. Every rank must make this call and run its
             backward pass. As in gsplat, meta's splats are those of this rank's Gaussians in the views of all
             ranks, and its tile lists belong to this rank's images.
         camera_model: "pinhole", or with `with_ut` OpenCV's "fisheye".
-        segmented: accepted and not needed: it selects a sort in gsplat, never the result.
         covars: [..., N, 3, 3] covariances instead of quats and scales; only their upper triangles are read.
             They are decomposed, which costs more than the rest of the call; quats and scales are faster.
         return_normals: whether to render normals into `meta["normals"]`, [..., C, H, W, 3]: the sum of

@@ -34,10 +34,8 @@ class GaussianRasterizationSettings(NamedTuple):
     """A view and how to render it; the fields of INRIA's class of this name, in its order.
 
     Attributes:
-        image_height: px.
-        image_width: px.
-        tanfovx: tangent of half the horizontal field of view.
-        tanfovy: tangent of half the vertical field of view.
+        image_height, image_width: px.
+        tanfovx, tanfovy: tangents of half the horizontal and vertical field of view.
         bg: [C], the background.
         scale_modifier: factor of the scales; `cov3D_precomp` ignores it.
         viewmatrix: [4, 4], world to camera for row vectors: the transpose of the usual matrix. A rotation and
@@ -46,8 +44,7 @@ class GaussianRasterizationSettings(NamedTuple):
             must be those of tanfovx and tanfovy.
         sh_degree: degree to evaluate, 0 to 3.
         campos: [3], the camera's centre; must fit `viewmatrix` if SH are rendered.
-        prefiltered: accepted, without effect.
-        debug: accepted, without effect.
+        prefiltered, debug: accepted, without effect.
         antialiasing: whether opacities are compensated for the blur. None is the class without this field:
             the rasteriser then returns no inverse depths.
     """

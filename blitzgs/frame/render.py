@@ -95,9 +95,8 @@ def render_frame(
     # given the capacity for the frame (see `run_attempts`).
     active: ActiveRows | Callable[[Sizes | None], ActiveRows] | None = None,
     assignment: TileAssignment | None = None,  # tiles of each rank (collective); None: all are here
-    # sends the splats to the ranks that composite them. A transport that is used for several frames estimates
-    # the sizes of a frame from the frames before, so that the device need not wait for the host; the result
-    # does not depend on it. None: a new one.
+    # sends the splats to the ranks that composite them; used for several frames, it estimates their sizes, so
+    # that the device need not wait for the host. None: a new one.
     transport: Transport | None = None,
     backward_follows: bool = False,  # makes a backward pass faster, which also works without
     backgrounds: Tensor | None = None,  # colours [B, 3] behind everything; None: of the options

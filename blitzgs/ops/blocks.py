@@ -73,8 +73,7 @@ def morton_keys(points: Tensor) -> Tensor:
 
 
 def update_block_bounds_(
-    # float32 [ceil(N / 256), 8]: lowest and highest corner of where the means can be, largest standard
-    # deviation, 1 when all rows are finite
+    # float32 [blocks, 8]: low and high corner of the means, largest deviation, 1 when all rows are finite
     bounds: Tensor,
     ids: Tensor | None,  # int32 [U], rows that changed
     means: Tensor,  # float32 [N, 3]
@@ -94,11 +93,9 @@ def cull_blocks(
     limits: tuple[float, float, float],  # near and far plane (near < z <= far), blur eps2d, px^2
     pending: PendingSteps | None = None,  # as given to `update_block_bounds_`
     level_ranges: Tensor | None = None,  # uint8 [blocks, 2], coarsest and finest level; for `rules`
-    # also drop the rows that these rules leave out wherever their pending steps may move them; `gate_views_`
-    # decides about the remaining rows. None: no rules.
+    # also drop what these leave out whatever steps are pending; `gate_views_` decides about the rest
     rules: GateRules | None = None,
-    # capacity of the lists, in blocks of 256 rows, at least 1. None: exactly as many blocks as the views may
-    # see; the host then waits for this number.
+    # of the lists, at least 1; None: exactly what the views may see, for whose number the host waits
     capacity_blocks: int | None = None,
 ) -> ActiveRows:
     """Return the rows that at least one of the views (32 at most) may see; blocks outside all are not read.

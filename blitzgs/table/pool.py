@@ -71,12 +71,11 @@ class Pool:
 
     Between `load_for_step` and `write_back` the table on the host is out of date; `write_back` copies all
     changes to it and empties the pool.
-
-    Attributes:
-        table: the table on the host.
-        held: the table on the device; rows outside the blocks of `load_for_step`'s index are undefined.
-        moved: counts since the beginning.
     """
+
+    table: HostTable  # on the host
+    held: GaussianTable  # on the device; rows outside the blocks of `load_for_step`'s index are undefined
+    moved: Moved  # counts since the beginning
 
     def __init__(
         self, table: HostTable, device: torch.device, budget_bytes: int, pending_table: Tensor | None
