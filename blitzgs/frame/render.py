@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Renders views of a table and their gradients without autograd, in the one loop over attempts.
 
-`render_frame` projects the active Gaussians, lists them by tile and composites them; the result is a `Frame`.
-`backward_splats` computes the gradients of the projected splats from the gradients of the images. `survey`
-measures what each Gaussian contributes to each view. No tensor here is as long as the table: the cost follows
-the Gaussians that the views see. Between projection and tile intersection, a transport
-(`blitzgs.frame.transport`) sends the splats to the ranks that composite them, and later returns their
-gradients.
+No tensor here is as long as the table: the cost follows the Gaussians that the views see. Between projection
+and lists, a transport sends the splats to the ranks that composite them, and later returns their gradients.
 """
 
 from __future__ import annotations

@@ -20,6 +20,7 @@ from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
 # Rows with 48 coefficients are about 200 MB together.
 _PART = 1 << 18
+_GROUPS = (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)
 
 
 class TableAdam:
@@ -129,9 +130,7 @@ class Pending:
         names = (*PARAMETERS, *EXP_AVGS, *EXP_AVG_SQS, "last_step", "moment_step")
         taken = take_rows([table[name] for name in names], rows)
         part = {name: column.to(self._device) for name, column in zip(names, taken, strict=True)}
-        params, exp_avgs, exp_avg_sqs = (
-            [part[name] for name in group] for group in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)
-        )
+        params, exp_avgs, exp_avg_sqs = ([part[name] for name in group] for group in _GROUPS)
         state = AdamState(params, exp_avgs, exp_avg_sqs, part["last_step"], part["moment_step"])
         lazy_adam_catch_up_(state, self._optimiser.schedule, self._step)
         names = (*PARAMETERS, "last_step")

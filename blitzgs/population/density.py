@@ -79,13 +79,11 @@ def densify(
     """Run one density event, and reset the statistics that it used.
 
     A candidate is a Gaussian with at least `min_observations` gradients whose mean, `grad_sum / grad_count`,
-    reaches the threshold. A small candidate gets a copy. A large one is replaced by two children that are
-    drawn from it and are 1.6 times smaller (Kerbl et al. 2023, section 5). A copy has its parent's octree
-    level, a child of a split the next one. Both have the parent's phi and cull row, and moments of zero.
-    Their ids and random positions depend only on the parent's id, `time` and the child's slot, so the result
-    does not depend on the order of the rows.
-
-    Pruning applies to old and new rows; a new row has no screen radius yet.
+    reaches the threshold. A small candidate gets a copy; a large one is replaced by two children that are
+    drawn from it and are 1.6 times smaller (Kerbl et al. 2023, section 5), one octree level finer. New rows
+    have the parent's phi and cull row, and moments of zero. Ids and random positions depend only on the
+    parent's id, `time` and the child's slot. Pruning applies to old and new rows; a new row has no screen
+    radius yet.
     """
     gradient = table["grad_sum"] / table["grad_count"].clamp(min=1)
     candidates = (gradient >= rules.grad_threshold) & (table["grad_count"] >= rules.min_observations)

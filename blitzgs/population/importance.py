@@ -1,13 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The importance passes: a sweep over all training views scores every Gaussian, then some are pruned.
 
-docs/guide/fewer-gaussians.md defines the scores, phi and the cull matrix. "density" is the contribution per
-pixel, however many pixels a Gaussian covers, so large Gaussians are pruned first. "weight" is the total
-contribution, which the images lose if the Gaussian is pruned. "energy" is proportional to the squared error
-of the images after it is pruned, if every Gaussian differs equally from the colours behind it.
-
-The views see the Gaussians of all ranks. All sums are integers, so every result has the same bits at any
-world size and for any division of the work.
+docs/guide/fewer-gaussians.md defines the scores, phi and the cull matrix. The views see the Gaussians of all
+ranks. All sums are integers, so every result has the same bits at any world size and for any division of the
+work.
 """
 
 from __future__ import annotations

@@ -51,17 +51,15 @@ def relocate(
     lineage: Lineage | None = None,  # logs births and deaths, or None
     pending: Pending | None = None,  # pending steps of the table, which sources take; None: none
 ) -> DensityReport:
-    """Replace dead Gaussians by copies of live ones, and let the population grow.
+    """Replace dead Gaussians by copies of live ones, and let the population grow (3DGS-MCMC, section 3.4).
 
     Dead Gaussians are those that density control would prune. The number of copies is that of the dead plus
-    the share `growth` of the population. Live Gaussians are drawn for copying in proportion to their opacity
-    (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo", section 3.4). A Gaussian and
-    its copies have one position, and share opacity and size such that together they look like the Gaussian
-    before (`shared_among_copies`). The copied Gaussian keeps its moments, scaled as its gradients are
-    (`share_rows_`), and the copies begin with moments of zero. Copies have the level, phi and cull row of the
-    Gaussian that they copy, and no statistics. Draws and ids depend only on (seed, time, id), so the result
-    depends neither on the order of the rows nor on the number of ranks. Returns the report; `cloned` is the
-    number of all copies on this rank, `relocated` that of the dead they replace.
+    the share `growth` of the population. Live Gaussians are drawn for copying in proportion to their opacity.
+    A Gaussian and its copies have one position, and share opacity and size such that together they look like
+    the Gaussian before (`shared_among_copies`). It keeps its moments, scaled as its gradients are
+    (`share_rows_`); copies begin with moments of zero and without statistics, and have its level, phi and
+    cull row. Draws and ids depend only on (seed, time, id). In the report, `cloned` is the number of all
+    copies on this rank, `relocated` that of the dead they replace.
     """
     opacities = current(table, "opacities", pending)
     causes = death_causes(table, rules, opacities, pending)
@@ -126,17 +124,15 @@ def shared_among_copies(opacities: Tensor, scales: Tensor, copies: Tensor) -> tu
 def draw_in_proportion(
     weights: Tensor, total: int, count: int, ids: Tensor, seed: int, time: int, ranks: Ranks
 ) -> Tensor:
-    """Draw `count` times in proportion to weights, over all ranks.
+    """Draw `count` times in proportion to weights, over all ranks; every rank calls this.
 
     The expectation for each row is count w / sum(w), as in a multinomial draw. A row gets the integer part of
     this number for certain; the fractional parts are drawn without replacement (residual resampling, Liu and
     Chen 1998). This has the least variance, and exactly `count` draws in all, except that no row is drawn
     `MAX_COPIES` times.
 
-    `weights`: int64 [N_rank], 0 to 2^31, fewer than 2^31 over all ranks; `total`: their sum over all ranks.
-    `count`: below 2^31. `ids`: int64 [N_rank], persistent. `time`: of the event, in images. Every rank calls
-    this. Returns int64 [N_rank], how often each row was drawn, the same for the same ids at every world size;
-    zeros if all weights are 0.
+    `weights`: int64 [N_rank], 0 to 2^31, fewer than 2^31 over all ranks, as is `count`; `total`: their sum.
+    Returns int64 [N_rank], how often each row was drawn; zeros if all weights are 0.
     """
     if total == 0 or count <= 0:
         return torch.zeros_like(weights)

@@ -61,26 +61,21 @@ def level_fork(config: Config) -> float:
 def footprint_sizes(scales: Tensor, opacities: Tensor) -> Tensor:
     """Return the logarithms of o sqrt(a b) of Gaussians, float64 [N], in the unit of the scales.
 
-    a and b are the largest two scales of a Gaussian and o is its opacity. This size times the focal length
-    over the distance is its footprint in pixels. In a picture that sees the broad side of the Gaussian and
-    nothing in front, pi times the square of the footprint is the sum of alpha^2, to which the squared error
-    is proportional that leaving the Gaussian out makes.
-
-    `scales`: logarithms, [N, 3]. `opacities`: logits, [N].
+    a and b are the largest two scales (given as logarithms, [N, 3]) and o is the opacity (logits, [N]). This
+    size times the focal length over the distance is the footprint in pixels. Where a picture sees the broad
+    side and nothing in front, pi times its square is the sum of alpha^2, to which the squared error is
+    proportional that leaving the Gaussian out makes.
     """
     broad = scales.double().sum(1) - scales.double().amin(1)
     return 0.5 * broad + torch.nn.functional.logsigmoid(opacities.double())
 
 
 def footprint_levels(sizes: Tensor, reach: float, reference_distance: float, fork: float) -> Tensor:
-    """Return the levels that follow what Gaussians are, uint8 [N].
+    """Return the levels that follow what Gaussians are, uint8 [N], from their `footprint_sizes`.
 
     The level is the finest whose `farthest` distance is at least that at which the footprint becomes too
     small. So a view that leaves out levels by distance leaves out only Gaussians of smaller footprints.
-
-    `sizes`: `footprint_sizes`, [N]. `reach`: distance at which the footprint of a size of 1 becomes too
-    small: the focal length in pixels over the smallest footprint. `reference_distance`: d_0 of the levels.
-    `fork`: ratio of neighbouring levels, of which there are `FOOTPRINT_LEVELS`.
+    `reach`: this distance for a size of 1, the focal length in pixels over the smallest footprint.
     """
     level = ((math.log(reference_distance / reach) - sizes) / math.log(fork) + 0.5).floor()
     return level.clamp(0, FOOTPRINT_LEVELS - 1).to(torch.uint8)
