@@ -81,8 +81,7 @@ class Gaussians(NamedTuple):
     """The checked arguments of a call: S scenes of N Gaussians and C views each, I = S C images."""
 
     function: str  # name of the public function, for warnings
-    # The scenes, S >= 1. Without batch dimensions it has the caller's own tensors, so that a leaf stays a
-    # leaf.
+    # S >= 1. Without batch dimensions, these are the caller's own tensors: a leaf stays a leaf.
     scenes: tuple[Scene, ...]
     colors: Tensor | None  # colours of all scenes, as given by the caller
     opacities: Tensor  # opacities of all scenes, as given by the caller

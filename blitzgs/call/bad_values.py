@@ -138,10 +138,8 @@ def watch_for_non_finite(
     """Warn about arguments of a renderer with values that are not finite, after a cheap check for any.
 
     On CUDA most calls check the cameras alone, see `EVERY_CUDA_CALLS`. SH coefficients, the largest part of a
-    Gaussian, are only checked for visible Gaussians.
-
-    `nan_marks`: a value for each Gaussian, NaN if its colours are values that are not finite, or its extra
-    signals are not.
+    Gaussian, are only checked for visible Gaussians. `nan_marks`: for each Gaussian, NaN if its colours (if
+    they are values) or its extra signals are not finite.
     """
     named = gaussians.named
     first = named["means"][0]

@@ -181,9 +181,9 @@ def lists_of(
 ) -> tuple[Lists, Lists]:
     """Return the tile lists for meta, and those to composite.
 
-    `count`: number of entries of the lists for meta; -1: unknown. `pixels`: the pixels that are rendered: the
-    lists of tiles without any are empty, and those of the others are as in the whole image, so that these
-    pixels have the same bits. None: all.
+    `count`: number of entries of the lists for meta; -1: unknown. `pixels`: the pixels that are rendered;
+    lists of tiles without any are empty, and others are those of the whole image, so that these pixels have
+    the same bits. None: all.
     """
 
     def listed_by(edge: int, n_isects: int) -> Lists:

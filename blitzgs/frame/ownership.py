@@ -27,8 +27,7 @@ _MAX_NUMBERS = 8192
 # Divisions use the costs of a batch only after this number of later batches. By then the host has read the
 # sums of the batch, with its losses. It therefore does not wait, and all ranks have the same costs.
 _DELAY = 2
-# The costs of a view that was not visited yet are estimated as the mean costs of this number of other views,
-# those that were visited last.
+# A view that was not visited yet has the mean costs of this number of the latest others.
 _SIMILAR = 16
 # The costs of such a view.
 _UNKNOWN = torch.empty(0, dtype=torch.float16)
@@ -55,10 +54,9 @@ def _measured(sums: HostSum, keys: Sequence[Hashable], tiles: int, first: int) -
 
 
 class TileOwners:
-    """Divides the tiles of each batch by their costs at the last visit of each view.
+    """Divides the tiles of each batch by their costs at the last visit of each view, at most 16 KB a view.
 
-    Every rank has the same costs, so all ranks compute the same division without communication. The costs of
-    a view take at most 16 KB. The host does not wait to divide a batch.
+    Every rank has the same costs, so all ranks compute the same division without communication or waiting.
     """
 
     def __init__(self, ranks: Ranks) -> None:
@@ -142,11 +140,10 @@ class TileOwners:
     ) -> HostSum:
         """Store the costs of a batch's tiles for divisions from the batch after the next on. Collective.
 
-        On CUDA the host does not wait for a batch whose losses it has read.
-
         `tile_work`: int32 [B * T], number of list entries that were composited in each tile. `ranges`: the
-        tiles of each rank; the cost of a tile is that measured by its owner. `parts`: float64 [B, K, 2], sums
-        of this rank's loss, which are sent together with the costs. Returns the sums; see `HostSum.read`.
+        tiles of each rank, which measures their costs. `parts`: float64 [B, K, 2], sums of this rank's loss,
+        which are sent together with the costs. Returns the sums (`HostSum.read`); on CUDA the host does not
+        wait for a batch whose losses it has read.
         """
         if len(self._delayed) == _DELAY:
             self._learn(self._delayed.popleft())

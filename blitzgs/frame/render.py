@@ -218,11 +218,10 @@ def run_attempts(
 ) -> tuple[ExchangeResult, Outputs]:
     """Queue a frame's work, without gradients, until all results had enough memory.
 
-    `attempt`: given the capacity that `transport` estimates (None: the sizes are not known, and the work
-    waits for them), projects and sends the splats with `transport`, and queues the work with those that
-    arrive. It returns the exchange and the outputs of this work, and keeps neither: another attempt needs
-    their memory. Returns the splats, cut to their numbers, and the outputs of the last attempt. RuntimeError:
-    `MAX_ATTEMPTS` attempts did not suffice, each with the sizes that the last one needed.
+    `attempt`: given the capacity that `transport` estimates (None: the work waits for the sizes), projects
+    and sends the splats, and queues the work with those that arrive. It returns the exchange and the outputs
+    of this work, and keeps neither: another attempt needs their memory. Returns the splats, cut to their
+    numbers, and the outputs of the last attempt. RuntimeError: `MAX_ATTEMPTS` attempts did not suffice.
     """
     for _ in range(MAX_ATTEMPTS):
         capacity = None if transport.estimate is None else transport.estimate.sizes

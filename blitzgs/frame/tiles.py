@@ -16,8 +16,7 @@ from blitzgs.ops.intersect import pixels_of_tiles, tile_counts
 if TYPE_CHECKING:
     from blitzgs.distributed.group import Ranks
 
-# The loss of an owned pixel reads pixels up to this distance: 5 px for its window, and 5 more for the
-# gradient.
+# The loss of an owned pixel reads pixels up to this distance: 5 px of its window, 5 of the gradient.
 LOSS_HALO = 10
 
 
@@ -55,8 +54,8 @@ class TileRanges:
     def composited(self, rank: int) -> tuple[int, int]:
         """Return the [first, one past last) tile that a rank composites: its own and those within `halo`.
 
-        The range may contain a few further tiles, because it is contiguous in the flattened order; it never
-        leaves the view. It is empty for a rank without tiles. The first tiles ascend with the ranks.
+        The range is contiguous and may contain a few further tiles, but never leaves the view. It is empty
+        for a rank without tiles. The first tiles ascend with the ranks.
         """
         begin, end = self.of(rank)
         ring = -(-self.halo // self.tile_size)

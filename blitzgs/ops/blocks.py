@@ -17,9 +17,8 @@ from blitzgs._library import below_autograd
 from blitzgs.ops.projection_types import Views
 
 BLOCK_ROWS = 256
-# Optimiser state that bounds how far rows may move when their pending steps are applied: first and second
-# moments of the means, then of the log scales, float32 [N, 3]; `last_step` and `moment_step`, int32 [N], as
-# `AdamState` has them; and `AdamSchedule.table`.
+# What bounds how far pending steps move rows: first and second moments of means, then of log scales, float32
+# [N, 3]; `last_step` and `moment_step`, int32 [N], as `AdamState` has them; and `AdamSchedule.table`.
 PendingSteps = Sequence[Tensor]
 
 

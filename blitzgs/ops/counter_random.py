@@ -73,8 +73,7 @@ def key_histogram(
 
 def find_digit_(
     # int64 [3], changed in place: the digits so far, as a number; how many keys are still to be found under
-    # them, from 1 on; and how many keys have them, which is only written. If there are too few keys, the last
-    # digit is taken.
+    # them, from 1 on; how many have them, only written. If there are too few, the last digit is taken.
     search: Tensor,
     counts: Tensor,  # of the keys by their next digit, int64 [2^width]
 ) -> None:

@@ -23,11 +23,9 @@ def first_only(
 
     Autograd sees no connection between a hand-written gradient and the op's inputs, so a second derivative
     would silently be zero. When torch records the backward pass (`create_graph=True`), this function
-    therefore connects the gradients with all inputs through a function whose backward pass raises an error.
-
-    `op`: its name, for errors. `compute`: returns gradients of the op's inputs; autograd records nothing of
-    it. `inputs`: what these depend on: the op's inputs and the gradients of its outputs. RuntimeError: the
-    backward pass runs under vmap.
+    therefore connects the gradients with `inputs`, the op's and the gradients of its outputs, through a
+    function whose backward pass raises an error. `op`: its name. RuntimeError: the backward pass runs under
+    vmap.
     """
     recorded = torch.is_grad_enabled()
     try:

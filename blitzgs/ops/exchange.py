@@ -44,11 +44,6 @@ def gather_splats(
     ]
 
 
-def place_runs(splats: int) -> int:
-    """Return the number of entries of `places` for each rank."""
-    return -(-splats // PLACE_SPLATS)
-
-
 def words_per_splat(column: Tensor) -> int:
     """Return how many 32-bit words one splat takes in a column."""
     return math.prod(column.shape[1:]) * column.element_size() // 4
@@ -58,8 +53,7 @@ def words_of(column: Tensor) -> Tensor:
     """View a column [P, ...] as int32 [P, words]."""
     flat = column.reshape(len(column), math.prod(column.shape[1:]))
     if flat.stride() != (flat.shape[1], 1):
-        # Viewing another dtype needs more than `contiguous`: the strides must be exact even for a single
-        # splat.
+        # Viewing another dtype needs exact strides, also of a single splat.
         flat = flat.clone(memory_format=torch.contiguous_format)
     return flat.view(torch.int32)
 

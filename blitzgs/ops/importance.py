@@ -11,9 +11,8 @@ from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 
-# Units of a weight in 1, kContributionScale of csrc/importance/importance.h. The op `contributions` returns
-# sums of such integers, so that they do not depend on the order of addition, and the sums of disjoint ranges
-# of tiles add up to the sum of all tiles.
+# Units of a weight in 1, kContributionScale of csrc/importance/importance.h. Sums of such integers depend on
+# no order of addition, and those of disjoint ranges of tiles add up.
 UNITS = 1 << 32
 # How many times a weight is divided by the square root of its number of pixels, for each score rule.
 DIVISIONS = {"weight": 0, "root": 1, "density": 2}

@@ -240,9 +240,8 @@ def project_bwd_step_(
     state: AdamState,  # parameters before their activation; float32 or (CPU) float64
     schedule: AdamSchedule,  # of S steps, for the dtype of the parameters
     step: int,  # 1 <= step <= S
-    # viewmats and Ks that the splats were projected into, and weights per view, [B], of the smallest axis and
-    # of the opacity of each Gaussian visible in it (before the compensation of antialiased splats); None: no
-    # such term
+    # viewmats and Ks of the splats, and weights per view, [B], of the smallest axis and of the opacity of
+    # each Gaussian visible in it (before antialiased splats are compensated); None: no such term
     views: tuple[Tensor, Tensor, Tensor | None, Tensor | None],
     splats: ProjectedSplats,  # the P splats that `project` returned for these parameters and views
     options: ProjectionOptions,  # of the projection; parameters are taken before their activation

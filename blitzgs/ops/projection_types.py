@@ -157,8 +157,7 @@ class ProjectionInputs(NamedTuple):
 class ProjectionOutputs(NamedTuple):
     """What `ProjectionInputs.project` returns."""
 
-    # Columns as long as the given capacity, if there was one; `counts` is None. The contents are undefined if
-    # the capacity was too small.
+    # as long as the given capacity, if any, without `counts`; undefined if the capacity was too small
     splats: ProjectedSplats
     ids: Tensor  # int64 [P], persistent ids of the splats' Gaussians; [0] if `ProjectionInputs.ids` is None
     # int64 [VIEW_TOTALS + B + 2 M], on the device, right even if the capacity was too small: `Sizes` (with an

@@ -155,8 +155,7 @@ def gradient_table_of(columns: Sequence[Tensor | None]) -> Tensor | None:
 class SplatGradients(NamedTuple):
     """Gradients of P splats in one of two forms."""
 
-    # Columns (v_means2d [P, 2], v_conics [P, 3], v_opacities [P], v_colors [P, 3]); or (CUDA) one table [P,
-    # 12].
+    # v_means2d [P, 2], v_conics [P, 3], v_opacities [P], v_colors [P, 3]; or (CUDA) one table [P, 12]
     parts: Sequence[Tensor]
 
     @property
@@ -193,12 +192,10 @@ class RasterizeSaved(NamedTuple):
 
     splats: list[Tensor]  # means2d [P, 2], conics [P, 3], splat_opacities [P], colors [P, D]
     backgrounds: Tensor | None  # [B, D]; None: black
-    # isect_splats, int32 [I], the splats of each tile, front to back; tile_offsets, int64 [B * T + 1], where
-    # each tile's list begins.
+    # isect_splats, int32 [I], by tile, front to back; tile_offsets, int64 [B T + 1], where each begins
     lists: list[Tensor]
-    # transmittances [B, H, W], the weight of the background in each pixel; last_ids, int32 [B, H, W], where
-    # each pixel's list ended; packed_splats and tile_order, the splats and the order of the tiles in layouts
-    # that only the kernels of the backend read.
+    # transmittances [B, H, W]; last_ids, int32 [B, H, W], where each pixel's list ended; packed_splats and
+    # tile_order, in layouts that only the kernels of the backend read.
     composited: list[Tensor]
 
 
@@ -210,8 +207,7 @@ class GradientBuffer:
     """
 
     zeros: Tensor | None  # [P or more, 12], the last output of `rasterize_fwd`; [0, 12] or None: none
-    # Returns zeroed memory for later backward passes. If it is None or returns None, memory is allocated
-    # instead.
+    # zeroes memory for later backward passes; without it, or if it returns None, some is allocated
     others: Callable[[], Tensor | None] | None = None
 
     def take(self, means2d: Tensor) -> Tensor:

@@ -21,13 +21,11 @@ _ANGLES = 4096
 class Lenses(NamedTuple):
     """What B views have besides viewmats and intrinsics."""
 
-    # [B, 13]: OpenCV's k1 to k6, p1, p2, s1 to s4 and the largest angle of a fisheye, radians, see
-    # `largest_angles`.
+    # [B, 13]: OpenCV's k1 to k6, p1, p2, s1 to s4, largest angle of a fisheye (`largest_angles`)
     lenses: Tensor
     viewmats_rs: Tensor | None = None  # [B, 4, 4], poses at the end of a rolling shutter's frame
     fisheye: bool = False  # whether k1 to k4 are those of OpenCV's fisheye, and the others unused
-    # What is exposed first: 0 the top row, 1 the left column, 2 the bottom row, 3 the right column, 4 all at
-    # once.
+    # what is exposed first: 0 the top row, 1 the left column, 2 the bottom row, 3 the right one, 4 all
     shutter: int = GLOBAL_SHUTTER
     # Alpha, beta, kappa; how many image sizes beside the image a sigma point is valid; and whether all (1) or
     # some (0) of the points of a Gaussian have to be valid.

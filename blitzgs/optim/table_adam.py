@@ -28,8 +28,7 @@ class TableAdam:
 
     The batch scaling is that of Grendel-GS (Zhao et al. 2024). A step does not touch rows that it does not
     update; the columns `last_step` and `moment_step` note how far each row is current. `catch_up` must be
-    called before the parameters of such rows are read. Use this class for a `GaussianTable` and a `Schedule`
-    that is known in advance, as the trainer does, and `blitzgs.optim.LazyAdam` in a loop of your own.
+    called before the parameters of such rows are read. In a loop of your own, use `blitzgs.optim.LazyAdam`.
     """
 
     def __init__(self, config: OptimiserConfig, schedule: Schedule, extent: float, device: object) -> None:

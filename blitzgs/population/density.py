@@ -256,8 +256,8 @@ def memory_limit(table: GaussianTable, ranks: Ranks) -> int | None:
     """Predict how many Gaussians fit into the memory of all ranks; None if the CPU computes. Collective.
 
     The memory is that of the GPUs, or of the hosts if the tables are stored there. A density event makes a
-    second copy of one column at a time. A step also needs scratch memory on the GPU, which is assumed to grow
-    with the population: the largest amount so far beyond the table, per Gaussian.
+    second copy of one column at a time. A step also needs scratch memory on the GPU: the largest amount so
+    far beyond the table, per Gaussian.
     """
     if ranks.device.type != "cuda":
         return None

@@ -146,8 +146,8 @@ def draw_in_proportion(
 class PositionNoise:
     """The noise term of 3DGS-MCMC (Kheradmand et al. 2024, eq. 8), for the Gaussians that a step sees.
 
-    In 3DGS-MCMC, the noise depends on the unit of length, because it contains the covariance, a squared
-    length. Here it is divided by the squared extent of the scene, so that it does not.
+    It contains the covariance, a squared length, and is divided by the squared extent of the scene, so that
+    it does not depend on the unit of length.
     """
 
     factor: float  # `optimiser.position_noise`

@@ -209,7 +209,6 @@ def contributions(
     *,
     near_plane: float = 0.01,
     far_plane: float = 1e10,
-    eps2d: float = 0.3,
     antialiased: bool = False,
 ) -> Contributions:
     """Compute what activated Gaussians contribute to views; arguments as for `blitzgs.contributions`."""
@@ -219,7 +218,7 @@ def contributions(
     result = Contributions(*(torch.zeros(shape, dtype=dtype) for dtype in dtypes))
     for v, camera in enumerate(zip(viewmats, Ks, strict=True)):
         tensors: Any = (tensor.double() for tensor in (means, quats, scales, opacities, means, *camera))
-        splats = project_splats(*tensors, **view, sh_degree=None, eps2d=eps2d, antialiased=antialiased)
+        splats = project_splats(*tensors, **view, sh_degree=None, eps2d=0.3, antialiased=antialiased)
         weights, cut = composited_weights(
             splats.means2d, splats.conics, splats.opacities, splats.depths, width, height
         )

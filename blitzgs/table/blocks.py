@@ -71,8 +71,7 @@ def _without_far(points: Tensor) -> Tensor:
     if len(points) == 0:
         return points
     sample = points[:: -(-len(points) // _SAMPLE)]
-    # Of each axis, the finite values in order, and infinite ones. Quantiles that are values of the sample are
-    # the same on all devices.
+    # The finite values of each axis in order, then infinite ones. The same on all devices.
     ordered = sample.where(sample.isfinite(), torch.inf).sort(dim=0).values
     last = (sample.isfinite().sum(dim=0) - 1).clamp(min=0).double()
     low, high = ordered.gather(0, torch.stack((_SHARE * last, (1 - _SHARE) * last)).round().long())

@@ -218,9 +218,8 @@ class Pool:
     def prefetch(self, step: int) -> None:
         """Load the blocks of the next step, number `step`, while the step of `load_for_step` runs.
 
-        Call this after the host has waited for the running step's number of splats. Its active set is then
-        complete. Before that, the device may still read the cull masks of blocks that the step leaves out as
-        a whole, and this method may reuse their slots.
+        Call this after the host has waited for the running step's number of splats: before its active set is
+        complete, the device may still read the cull masks of blocks whose slots this method may reuse.
         """
         now = self._visibility.blocks_of_batch(0)
         slots = self._slot_of[now.nonzero()[0]]
@@ -231,8 +230,7 @@ class Pool:
         self._is_changed[slots] = True
         self._rest_changed = self._rest > 0
         self._count(steps=1, needed=len(slots))
-        # If a batch has more than half of the 32 views that are tested together, only the present batch is
-        # known.
+        # Of batches with more than half of the 32 views that are tested, only the present one is known.
         if self._visibility.batches > 1:
             following = self._visibility.blocks_of_batch(1)
             before = self.moved.loaded

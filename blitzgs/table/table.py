@@ -117,11 +117,9 @@ def stored_rows(name: str, count: int) -> int:
 class GaussianTable:
     """One rank's Gaussians as named columns of equal length N.
 
-    The operations `keep`, `permute`, `replace` and `move_rows` act on all columns, one column at a time, so
-    that peak memory exceeds the table by one column and not by a second table. `replace` touches only the
-    rows that change; for that, columns that grow have memory for more rows than they hold.
-
-    The column `CULL` is converted whenever it is set, read or moved.
+    Operations act on all columns, one column at a time, so that peak memory exceeds the table by one column
+    and not by a second table. `replace` touches only the rows that change; for that, columns that grow have
+    memory for more rows than they hold. The column `CULL` is converted whenever it is set, read or moved.
     """
 
     def __init__(self, columns: Mapping[str, Tensor]) -> None:

@@ -81,11 +81,10 @@ class ViewGate:
 class ModelGate:
     """The LOD gate of a model, applied only to views for which it leaves out enough Gaussians to pay.
 
-    A sample of the Gaussians of all ranks, drawn by their ids, predicts the share that each view would keep;
-    the prediction does not depend on the number of ranks. A view that would keep at least `most_kept` of all
-    Gaussians is rendered without the gate, because the gate would save little. So is a view that would keep
-    less than `least_kept`, which no training view does: there, coarse levels that have not been trained to
-    stand alone would show holes.
+    A sample of the Gaussians of all ranks, drawn by their ids, predicts the share that each view would keep.
+    A view that would keep at least `most_kept` of all is rendered without the gate, which would save little.
+    So is one that would keep less than `least_kept`, which no training view does: there, coarse levels that
+    have not been trained to stand alone would show holes.
     """
 
     def __init__(

@@ -165,7 +165,7 @@ class PointBlocks:
     """Boxes around blocks of neighbouring points, which bound their distances from cameras.
 
     A city has millions of points and thousands of cameras. The bounds decide nearly every question about
-    their distances, so that only few of the distances themselves need to be computed.
+    their distances, so that few of these need to be computed.
     """
 
     order: Tensor  # int64 [M], the points by block: `BLOCK_POINTS` in each, and the rest in the last one

@@ -56,7 +56,7 @@ from blitzgs.frame.transport.protocol import (
     WayBack,
     stage_ended,
 )
-from blitzgs.ops.exchange import place_runs
+from blitzgs.ops.exchange import PLACE_SPLATS
 from blitzgs.ops.host import current_stream
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats, splats_of
 from blitzgs.ops.rasterize import SPLAT_GRADIENT, SplatGradients
@@ -163,7 +163,12 @@ class PeerTransport:
             if not fits:
                 return traffic.needed, None
             way_back = PeerWayBack(
-                ranks, traffic, places[: place_runs(traffic.own.splats)], memory, generation, buffers.tables
+                ranks,
+                traffic,
+                places[: -(-traffic.own.splats // PLACE_SPLATS)],
+                memory,
+                generation,
+                buffers.tables,
             )
             return traffic.needed, ExchangeResult(
                 projected=splats_of(projected.splats, traffic.own),

@@ -161,9 +161,8 @@ class WayBack:
     def return_sums(self, sums: Tensor) -> Tensor:
         """Return integer sums over the tiles of each rank to the splats' owners, and add them up. Collective.
 
-        `sums`: int64 [R, C], sums of the splats that arrived here. Returns int64 [P, C], sums of this rank's
-        own splats; zero for splats that touch no tile. Integers add up exactly, so the result does not depend
-        on the number of ranks.
+        `sums`: int64 [R, C], of the splats that arrived here. Returns int64 [P, C], of this rank's own
+        splats; zero for splats that touch no tile. Integers add up exactly, whatever the number of ranks.
         """
         traffic = self.traffic
         returned = self.ranks.all_to_all(sums, traffic.received, traffic.sent)
@@ -195,18 +194,16 @@ class Transport(Protocol):
     ) -> Exchange:
         """Project this rank's Gaussians and send the splats to the ranks that composite them. Collective.
 
-        `inputs`: inputs of the projection, with the Gaussians' ids. `assignment`: the tiles of each rank;
-        None: this rank composites all tiles. `capacity`: the sizes to allocate; None: the host first waits
-        for the numbers.
+        `inputs`: with the Gaussians' ids. `assignment`: the tiles of each rank; None: this rank composites
+        all. `capacity`: the sizes to allocate; None: the host first waits for the numbers.
         """
 
 
 class CapacityEstimate:
     """Estimates the sizes that the next frame needs from the largest recent ones. Threads may share it.
 
-    If the host waited for the sizes, the device would be idle meanwhile. Instead, the host queues all the
-    work with the estimate, and reads the true sizes while the device works. If the estimate was too small,
-    the host queues the work again (`blitzgs.frame.render`).
+    The host queues all work with the estimate and reads the true sizes while the device works; if it was too
+    small, the host queues the work again (`blitzgs.frame.render`).
     """
 
     def __init__(self, sizes: Sizes | None = None) -> None:
