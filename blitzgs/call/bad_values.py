@@ -64,9 +64,8 @@ class CamerasOnHost:
         return bool(np.isfinite(values).all())
 
 
-# On CUDA, the first of this many calls of a size checks all arguments: the check is a pass over all
-# Gaussians, and their values that are not finite stay so. Cameras differ from call to call, so every call
-# looks for bad ones.
+# On CUDA, the first of this many calls of a size checks all arguments, in a pass over all Gaussians. Cameras
+# differ from call to call, so every call looks for bad ones.
 EVERY_CUDA_CALLS = 32
 COLOURS = ("colors", "sh0", "shN")
 SIGNALS = "extra_signals"

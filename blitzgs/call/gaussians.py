@@ -114,8 +114,7 @@ def position_noise(
         scales: [N, 3], logarithms.
         opacities: [N] or [N, 1], logits.
         scaler: inverse length; gsplat's MCMCStrategy passes the learning rate of the means times 5e5.
-        seed: seed of the run, 0 to 2^63 - 1.
-        step: each step draws other numbers.
+        seed, step: of the run, 0 to 2^63 - 1; each step draws other numbers.
         threshold: opacity at which the noise falls to a half.
 
     Returns:

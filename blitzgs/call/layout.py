@@ -30,9 +30,8 @@ CUDA_TILE_SIZE = 16
 class Places(NamedTuple):
     """Where P splats are in an arrangement."""
 
-    # (order,), int64 [P]: entry i is splat order[i], and each splat has one entry; or (images, gaussians),
-    # int32 [P] each: a splat is the entry [image, Gaussian] of an arrangement of all Gaussians in all images,
-    # and no two splats have the same entry.
+    # (order,), int64 [P]: entry i is splat order[i], each splat once; or (images, gaussians), int32 [P] each:
+    # each splat has its own entry [image, Gaussian] of an arrangement of all Gaussians in all images.
     indices: tuple[Tensor, ...]
     shape: tuple[int, ...]  # of the arrangement: [P], or [..., C, N] with images counted by [..., C]
 

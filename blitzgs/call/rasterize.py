@@ -144,10 +144,9 @@ def rasterization(
         with_ut: project by the unscented transform (docs/design.md), as in gsplat's main branch: images
             are distorted as their lenses are. Every Gaussian is projected into every view. Not with covars,
             sparse_grad, distributed, torch.compile or gradients of viewmats.
-        radial_coeffs: OpenCV's k1 to k6, [..., C, 6], or of a fisheye k1 to k4, [..., C, 4]; None: zeros, as
-            of the next two. Lenses and viewmats_rs get no gradient.
-        tangential_coeffs: p1 and p2, [..., C, 2].
-        thin_prism_coeffs: s1 to s4, [..., C, 4].
+        radial_coeffs, tangential_coeffs, thin_prism_coeffs: OpenCV's k1 to k6, [..., C, 6], p1 and p2, [...,
+            C, 2], and s1 to s4, [..., C, 4]; or of a fisheye k1 to k4, [..., C, 4], alone. None: zeros.
+            Lenses and viewmats_rs get no gradient.
         rolling_shutter: gsplat's `RollingShutterType`, or its name: which row or column is exposed first;
             None: "GLOBAL".
         viewmats_rs: poses at the end of a rolling shutter's frame, [..., C, 4, 4]; at its begin the camera is

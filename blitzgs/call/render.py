@@ -120,8 +120,7 @@ def render(
         composited=None if queued is None else queued.composited, meta_geometry=meta_geometry,
     )  # fmt: skip
     if not compiling:
-        # A view with a bad camera sees no Gaussian. Reading `cameras` does not wait: the host has waited for
-        # the projection, which was queued after their copy.
+        # A view with a bad camera sees no Gaussian. Reading `cameras` does not wait: they were copied before.
         suspects_cameras = cameras is not None and not cameras.are_finite()
         if queued is not None and queued.has_blank_view:
             check_intrinsics(gaussians.named["Ks"])
@@ -243,8 +242,7 @@ def _median_depths(splats: ProjectedSplats, lists: Lists, pixels: Pixels | None)
 
 def _nan_or_zero(table: Tensor) -> Tensor:
     """Return [N] for a table [N, D] or [C, N, D]: NaN for a row with a value that is not finite, else 0."""
-    # Zero times a number is zero unless the number is NaN or infinite. The product of a few channels at a
-    # time needs little memory.
+    # Zero times a number is NaN where it is not finite. The product of a few channels at a time is small.
     parts = [(part * 0).sum(dim=-1) for part in table.detach().split(_CHANNELS_AT_A_TIME, dim=-1)]
     total = parts[0] if len(parts) == 1 else torch.stack(parts).sum(dim=0)
     return total if total.dim() == 1 else total.sum(dim=0)

@@ -240,14 +240,11 @@ def _project(
     if decomposed is not None:
         rotations, scales = decomposed.quats, decomposed.scales
     assert rotations is not None and scales is not None
+    width, height, degree = map(int, (settings.image_width, settings.image_height, settings.sh_degree))
     options = ProjectionOptions(
-        int(settings.image_width),
-        int(settings.image_height),
-        sh_degree=int(settings.sh_degree) if sh is not None else 0,
-        near_plane=NEAR,
-        antialiased=bool(settings.antialiasing),
-        raw=False,
-    )
+        width, height, sh_degree=0 if sh is None else degree, near_plane=NEAR,
+        antialiased=bool(settings.antialiasing), raw=False,
+    )  # fmt: skip
     cameras = (settings.viewmatrix.to(means).mT.contiguous()[None], K)
     gaussians = gaussian_tensors(means, rotations, scales, opacities.reshape(-1), sh)
     inputs = ProjectionInputs(gaussians, cameras, options)

@@ -32,9 +32,8 @@ class TileRanges:
     width: int  # image width in pixels
     height: int  # image height in pixels
     tile_size: int = 16  # tile edge in pixels
-    # A rank also composites the tiles within this many pixels of its own; a tile that several ranks composite
-    # has the same bits on each. With `LOSS_HALO` a rank can compute its loss without pixels of other ranks.
-    # 0: only its own tiles.
+    # A rank also composites the tiles within this many pixels of its own, which have the same bits on each.
+    # With `LOSS_HALO` it can compute its loss without pixels of other ranks. 0: only its own tiles.
     halo: int = 0
 
     @cached_property
@@ -97,15 +96,13 @@ def collect_images(renders: Tensor, ranges: TileRanges, ranks: Ranks, destinatio
     """Send all pixels of a rendering, [B, H, W, C], contiguous, to one rank, whose `renders` gets them."""
     if ranks.world_size == 1:
         return
-    here, area = ranks.rank == destination, ranges.tile_size**2
-    owned = {rank: ranges.of(rank) for rank in range(ranks.world_size)}
+    here, others = ranks.rank == destination, [rank != destination for rank in range(ranks.world_size)]
+    owned = [ranges.of(rank) for rank in range(ranks.world_size)]
     outgoing = [] if here else [owned[ranks.rank]]
-    incoming = [stretch for rank, stretch in owned.items() if here and rank != destination]
-    sent, received = [0] * ranks.world_size, [0] * ranks.world_size
-    if here:
-        received = [area * (end - begin) * (rank != destination) for rank, (begin, end) in owned.items()]
-    else:
-        sent[destination] = area * sum(end - begin for begin, end in outgoing)
+    incoming = [stretch for stretch, other in zip(owned, others, strict=True) if here and other]
+    pixels = [ranges.tile_size**2 * (end - begin) for begin, end in owned]
+    sent = [pixels[ranks.rank] * (not here and not other) for other in others]
+    received = [n * (here and other) for n, other in zip(pixels, others, strict=True)]
     flat = renders.view(-1, renders.shape[-1])
     arrived = ranks.all_to_all(flat[_pixels(outgoing, ranges, renders.device)], sent, received)
     flat[_pixels(incoming, ranges, renders.device)] = arrived

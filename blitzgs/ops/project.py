@@ -46,8 +46,7 @@ def _gradients(
 
     def compute() -> Sequence[Tensor | None]:
         all_dense, means = not any(sparse), gaussians[0]
-        # If all Gaussians are visible, the rows of these are all rows. While torch traces the backward pass,
-        # the number of rows is unknown, and tensors are of another type.
+        # If all Gaussians are visible, their rows are all rows. While torch traces, their number is unknown.
         complete = all_dense and type(visible_ids) is Tensor and visible_ids.shape[0] == means.shape[0]
         # The kernel writes dense gradients only if all are needed; an unneeded one would cost memory.
         dense = all_dense and not complete and all(needed)

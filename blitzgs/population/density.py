@@ -44,9 +44,8 @@ class DensityRules:
     max_screen_radius: float | None = None  # pixels, since the last event; larger ones are pruned
     max_scale: float | None = None  # Gaussians with a larger axis are pruned; None: none are
     max_gaussians: int | None = None  # limit of the population after the event; None: no limit
-    # A Gaussian is judged when it has at least this many gradients; with fewer, its statistics are kept for
-    # the next event. A mean of few gradients is noisy, and the largest of many noisy means would make
-    # Gaussians without need.
+    # With fewer gradients a Gaussian is not judged, and its statistics are kept for the next event: the
+    # largest of many noisy means would make Gaussians without need.
     min_observations: int = 1
 
 

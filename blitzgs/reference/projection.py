@@ -191,12 +191,8 @@ def unscented_splats(
     apart = pixels - means2d[:, None]
     covariances = (weights[:, None, None] * apart[..., :, None] * apart[..., None, :]).sum(dim=1)
     depths = _points_at(means, view, torch.full_like(means[:, 0], 0.5))[:, 2]
-    return (
-        means2d,
-        torch.stack([covariances + 0.3 * torch.eye(2, dtype=means.dtype), covariances]),
-        depths,
-        valid,
-    )
+    both = torch.stack([covariances + 0.3 * torch.eye(2, dtype=means.dtype), covariances])
+    return means2d, both, depths, valid
 
 
 def _pixels(points: Tensor, view: View) -> tuple[Tensor, Tensor]:

@@ -41,8 +41,7 @@ def place(count: int, gone: Tensor, beside: Tensor, means: Tensor) -> Placement:
     is_left = torch.ones_like(gone, dtype=torch.bool)
     torch.ops.blitzgs.match_brackets_(new, is_left, keys, order, gone, by_block)
 
-    # Rows that are left and new Gaussians that are left come together one by one; those that are appended are
-    # in Morton order.
+    # Rows and new Gaussians that are left come together one by one; what is appended is in Morton order.
     rank_left = is_left.cumsum(0)
     left = gone.new_empty(leaving + 1)
     left[(rank_left - 1).where(is_left, leaving)] = gone

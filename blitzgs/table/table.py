@@ -31,9 +31,8 @@ _PAST_MOST = 1.02
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 EXP_AVGS = tuple(f"exp_avg.{name}" for name in PARAMETERS)
 EXP_AVG_SQS = tuple(f"exp_avg_sq.{name}" for name in PARAMETERS)
-# What new rows have in a column: values that the caller gives, or zeros. Columns that are added to
-# a table later are inherited: the caller gives the values of the parents (`inherited`). All columns
-# move with their rows.
+# What new rows have in a column: values that the caller gives, or zeros. For columns that are added to a
+# table later, the caller gives the values of the parents (`inherited`).
 REQUIRED = (*PARAMETERS, "last_step", "id", "parent", "birth", "level")
 ZERO_AT_BIRTH = (*EXP_AVGS, *EXP_AVG_SQS, "moment_step", "grad_sum", "grad_count", "max_radii")
 # A step asks for these columns several times; one call finds all of a group.

@@ -162,21 +162,14 @@ class PeerTransport:
                 fits &= traffic.most_isects <= capacity.isects and traffic.most_blocks <= capacity.blocks
             if not fits:
                 return traffic.needed, None
-            way_back = PeerWayBack(
-                ranks,
-                traffic,
-                places[: -(-traffic.own.splats // PLACE_SPLATS)],
-                memory,
-                generation,
-                buffers.tables,
+            own, arrived = (
+                splats_of(projected.splats, traffic.own),
+                buffers.splats.first(sum(traffic.received)),
             )
-            return traffic.needed, ExchangeResult(
-                projected=splats_of(projected.splats, traffic.own),
-                splats=buffers.splats.first(sum(traffic.received)),
-                totals=totals()[ranks.rank],
-                visible=shared.sums[VIEW_TOTALS : VIEW_TOTALS + n_views],
-                way_back=way_back,
-            )
+            runs = places[: -(-traffic.own.splats // PLACE_SPLATS)]
+            way_back = PeerWayBack(ranks, traffic, runs, memory, generation, buffers.tables)
+            visible = shared.sums[VIEW_TOTALS : VIEW_TOTALS + n_views]
+            return traffic.needed, ExchangeResult(own, arrived, totals()[ranks.rank], visible, way_back)
 
         n_isects = Traffic.of(totals(), n_views, ranks.rank).n_isects if capacity is None else capacity.isects
         stage_ended("exchange")
