@@ -72,7 +72,7 @@ def morton_keys(points: Tensor) -> Tensor:
 
 
 def update_block_bounds_(
-    # float32 [blocks, 8]: low and high corner of the means, largest deviation, 1 when all rows are finite
+    # float32 [blocks, 8]: box in which the means can be, largest standard deviation, 1 when all are finite
     bounds: Tensor,
     ids: Tensor | None,  # int32 [U], rows that changed
     means: Tensor,  # float32 [N, 3]
@@ -94,7 +94,7 @@ def cull_blocks(
     level_ranges: Tensor | None = None,  # uint8 [blocks, 2], coarsest and finest level; for `rules`
     # also drop what these leave out whatever steps are pending; `gate_views_` decides about the rest
     rules: GateRules | None = None,
-    # of the lists, at least 1; None: exactly what the views may see, for whose number the host waits
+    # room of the lists, at least 1; None: for what the views may see, for whose number the host waits
     capacity_blocks: int | None = None,
 ) -> ActiveRows:
     """Return the rows that at least one of the views (32 at most) may see; blocks outside all are not read.
