@@ -79,9 +79,8 @@ class _LinearMap(torch.autograd.Function):
         return None, None, *ctx.adjoint(ctx.needs_input_grad[2:], v_outputs)
 
 
-def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
-    """Return a sparse table of which only the rows `ids`, [U], ascending, each once, are not zero."""
-    indices = ids.long()[None]
+def sparse_rows(indices: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
+    """Return a sparse table of which only some rows, int64 [1, U], ascending, each once, are not zero."""
     if indices.shape[1] == 0:
         # Torch adds to an empty gradient in place, and would change the indices of all that share them.
         indices = indices.clone()
@@ -95,10 +94,11 @@ def full_gradients(
 ) -> list[Tensor | None]:
     """Return the gradients of parameters from those of their rows `ids` [U], each once; None: not needed."""
     ids = ids.long()
+    indices = ids[None]
 
     def full(gradient: Tensor, shape: torch.Size, is_sparse: bool) -> Tensor:
         if is_sparse:
-            return sparse_rows(ids, gradient, shape)
+            return sparse_rows(indices, gradient, shape)
         return gradient.new_zeros(shape).index_copy_(0, ids, gradient)
 
     every = zip(gradients, shapes, sparse, strict=True)
@@ -152,7 +152,7 @@ def of_shape(table: Tensor, shape: Sequence[int]) -> Tensor:
         if v[0] is None or not v[0].is_sparse:
             return [None if v[0] is None else v[0].reshape(table.shape)]
         values = raw_values(v[0])
-        return [sparse_rows(raw_indices(v[0])[0], values.reshape(len(values), *table.shape[1:]), table.shape)]
+        return [sparse_rows(raw_indices(v[0]), values.reshape(len(values), *table.shape[1:]), table.shape)]
 
     (reshaped,) = linear_map(lambda rows: (rows.reshape(tuple(shape)),), back, [table])
     return reshaped

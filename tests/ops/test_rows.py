@@ -119,7 +119,7 @@ class Rows(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, v_rows):
-        return sparse_rows(ctx.ids, v_rows, ctx.shape), None
+        return sparse_rows(ctx.ids.long()[None], v_rows, ctx.shape), None
 
 
 @pytest.mark.parametrize("dtype", [torch.int32, torch.int64])
@@ -144,7 +144,7 @@ def test_sums_of_gradients_are_summed(device):
 
 
 def test_foreign_sparse_tensors_are_coalesced():
-    kept = sparse_rows(torch.tensor([0, 1]), torch.ones(2, 1), torch.Size([3, 1]))
+    kept = sparse_rows(torch.tensor([[0, 1]]), torch.ones(2, 1), torch.Size([3, 1]))
     doubled = torch.sparse_coo_tensor(torch.tensor([[2, 2]]), torch.ones(2, 1), (3, 1))
     rows, values = distinct_rows(doubled)
     assert rows[0].tolist() == [2] and values.tolist() == [[2]]
