@@ -193,12 +193,8 @@ def rasterization(
     required: dict[str, object] = {"means": means, "opacities": opacities, "viewmats": viewmats, "Ks": Ks}
     if covars is None:
         required |= {"quats": quats, "scales": scales}
-    lens = {
-        "radial_coeffs": radial_coeffs,
-        "tangential_coeffs": tangential_coeffs,
-        "thin_prism_coeffs": thin_prism_coeffs,
-        "viewmats_rs": viewmats_rs,
-    }
+    lens = {"radial_coeffs": radial_coeffs, "tangential_coeffs": tangential_coeffs}
+    lens |= {"thin_prism_coeffs": thin_prism_coeffs, "viewmats_rs": viewmats_rs}
     given = {"colors": colors, "backgrounds": backgrounds, "covars": covars, "extra_signals": extra_signals}
     check_tensors(required, given | lens)
     of_lenses = (rolling_shutter, ut_params, *lens.values())
@@ -221,14 +217,10 @@ def rasterization(
     if with_ut:
         refused = {"covars": covars is not None, "sparse_grad": sparse_grad, "distributed": distributed}
         gaussians = with_lenses(gaussians, camera_model, rolling_shutter, ut_params, refused, lens)
-    background = None
-    if backgrounds is not None:
-        background = background_rows(backgrounds, gaussians, render_mode, return_normals)
+    background = background_rows(backgrounds, gaussians, render_mode, return_normals)
     if pixels is not None and (distributed or torch.compiler.is_compiling()):
         raise ValueError("pixels support neither distributed=True nor torch.compile; leave one out")
-    listed = None
-    if pixels is not None or image_ids is not None:
-        listed = checked_pixels(pixels, image_ids, gaussians.images, width, height)
+    listed = checked_pixels(pixels, image_ids, gaussians.images, width, height)
     image = ImageOptions(
         render_mode, background, packed, sparse_grad, absgrad, return_normals, return_median, listed
     )
