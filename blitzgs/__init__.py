@@ -53,10 +53,12 @@ _MODULES = {
 }
 
 
-def __getattr__(name: str) -> Any:
-    if name == "optim":
-        return import_module("blitzgs.optim")
-    for module, names in _MODULES.items():
-        if name in names:
-            return getattr(import_module(module), name)
-    raise AttributeError(f"module 'blitzgs' has no attribute {name!r}")
+if not TYPE_CHECKING:  # to a type checker, it would have every name
+
+    def __getattr__(name: str) -> Any:
+        if name == "optim":
+            return import_module("blitzgs.optim")
+        for module, names in _MODULES.items():
+            if name in names:
+                return getattr(import_module(module), name)
+        raise AttributeError(f"module 'blitzgs' has no attribute {name!r}")

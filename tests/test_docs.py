@@ -17,6 +17,7 @@ import yaml
 
 import blitzgs
 from blitzgs import cli
+from blitzgs.compat.gsplat import DefaultStrategy
 from blitzgs.config.fields import Config
 from blitzgs.config.files import to_dict
 from tests.training.tiny import OVERRIDES, write_tiny_capture
@@ -226,7 +227,6 @@ def test_every_message_of_the_troubleshooting_page_is_in_the_sources():
 
 
 def test_the_python_example_of_the_readme_runs(tmp_path, monkeypatch):
-    example = next(block for block in code_blocks(ROOT / "README.md", ["python"]) if "open_run" in block)
     monkeypatch.chdir(tmp_path)
     write_tiny_capture(tmp_path / "capture")
     flags = [
@@ -240,28 +240,69 @@ def test_the_python_example_of_the_readme_runs(tmp_path, monkeypatch):
     ]
     assert cli.main(["train", *flags]) == 0
     names = {}
-    exec(compile(example, "README.md", "exec"), names)
+    run_example("README.md", "open_run", names)
     assert names["image"].shape == (600, 800, 3)
     assert (tmp_path / "from_above.png").stat().st_size > 1000
 
 
-def test_the_example_of_the_single_ops_renders_the_image_of_the_one_call():
-    blocks = code_blocks(ROOT / "docs/guide/own-trainer.md", ["python"])
-    example = next(block for block in blocks if "import intersect" in block)
+def example_scene():
+    """What the examples of the pages take as given."""
     rng = torch.Generator().manual_seed(1)
     means, scales = torch.randn(30, 3, generator=rng), torch.rand(30, 3, generator=rng) * 0.2
     quats, opacities = torch.randn(30, 4, generator=rng), torch.rand(30, generator=rng) * 0.8 + 0.1
     sh = torch.randn(30, 16, 3, generator=rng) * 0.2
-    viewmats, width, height = torch.eye(4).repeat(2, 1, 1), 50, 40
+    viewmats = torch.eye(4).repeat(2, 1, 1)
     viewmats[:, 2, 3] = torch.tensor([5.0, 8.0])
     Ks = torch.tensor([[40.0, 0, 25], [0, 40, 20], [0, 0, 1]]).repeat(2, 1, 1)
-    names = {
-        "means": means, "quats": quats, "log_scales": scales.log(), "logits": opacities.logit(), "sh": sh,
+    names = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
+    return {**names, "viewmats": viewmats, "Ks": Ks, "width": 50, "height": 40, "sh_degree": 3}
+
+
+def run_example(page, part, names):
+    """Run the block of a page with this part as it stands; `names` are given to it and get its results."""
+    example = next(block for block in code_blocks(ROOT / page, ["python"]) if part in block)
+    exec(compile(example, page, "exec"), names)
+
+
+def test_the_examples_of_single_calls_run():
+    names = example_scene()
+    run_example("README.md", "from gsplat", names)
+    assert names["renders"].shape == (2, 1064, 1600, 4) and names["alphas"].shape == (2, 1064, 1600, 1)
+    run_example("docs/guide/fewer-gaussians.md", "contributions", names)
+    assert names["weights"].shape == names["pixels"].shape == names["visible"].shape == (2, 30)
+    run_example("docs/guide/own-trainer.md", "contributing_gaussian_ids", names)
+    assert names["gaussians"].shape == (2, 1064, 1600, 4) and names["gaussians"].unique().numel() > 20
+
+
+def test_the_examples_of_the_four_replacements_are_a_training():
+    page, names = "docs/guide/own-trainer.md", example_scene()
+    raw = {
+        "means": names["means"], "quats": names["quats"], "scales": names["scales"].log(),
+        "opacities": names["opacities"].logit(), "sh0": names["sh"][:, :1], "shN": names["sh"][:, 1:],
     }  # fmt: skip
-    names |= {"viewmats": viewmats, "Ks": Ks, "width": width, "height": height}
-    exec(compile(example, "own-trainer.md", "exec"), names)
-    views = (viewmats, Ks, width, height)
-    renders, alphas, _ = blitzgs.rasterization(means, quats, scales, opacities, sh, *views, sh_degree=3)
+    splats = {name: torch.nn.Parameter(value.clone()) for name, value in raw.items()}
+    strategy = DefaultStrategy(refine_start_iter=2, refine_every=4)
+    names |= {"blitzgs": blitzgs, "splats": splats, "rates": dict.fromkeys(raw, 1e-2), "strategy": strategy}
+    names |= {"state": strategy.initialize_state(), "masks": torch.rand(2, 40, 50) > 0.2}
+    names["pixels"] = torch.full((2, 40, 50, 3), 200, dtype=torch.uint8)
+    losses = []
+    run_example(page, "optimizers = {", names)
+    for names["step"] in range(25):  # a strategy that refines, and the Morton order in steps 0 and 20
+        run_example(page, "optimizers=optimizers", names)
+        strategy.step_pre_backward(splats, names["optimizers"], names["state"], names["step"], names["info"])
+        run_example(page, "loss = ", names)
+        names["loss"].backward()
+        losses.append(names["loss"].item())
+        run_example(page, "step_post_backward", names)
+    assert len(splats["means"]) > 60 and losses[-1] < 0.95 * losses[0]
+
+
+def test_the_example_of_the_single_ops_renders_the_image_of_the_one_call():
+    names = example_scene()
+    scene = [names[name] for name in ("means", "quats", "scales", "opacities", "sh", "viewmats", "Ks")]
+    renders, alphas, _ = blitzgs.rasterization(*scene, 50, 40, sh_degree=3)
+    names |= {"log_scales": names["scales"].log(), "logits": names["opacities"].logit()}
+    run_example("docs/guide/own-trainer.md", "import intersect", names)
     assert renders.amax() > 0.1
     torch.testing.assert_close(names["renders"], renders)
     torch.testing.assert_close(names["alphas"][..., None], alphas)

@@ -282,7 +282,8 @@ def _per_view(colors: Tensor, batch: tuple[int, ...], C: int, N: int, sh_degree:
     if sh_degree is not None:
         wanted = "SH coefficients [..., N, K, D], [..., C, N, K, D] or [N, K, D] when sh_degree is given"
         shape = tuple(colors.shape[:-2])
-    if shape not in ((*batch, N), (*batch, C, N)) or colors.dim() < 2:
+    # Two comparisons: torch.compile does not find sizes that vary in a tuple of shapes.
+    if (shape != (*batch, N) and shape != (*batch, C, N)) or colors.dim() < 2:
         hint = "; SH coefficients need sh_degree" if sh_degree is None and shape[:-1] == (*batch, N) else ""
         raise ValueError(
             f"colors must be {wanted}, here with {[*batch]} before N = {N}, C = {C}, got "

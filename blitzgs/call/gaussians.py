@@ -16,7 +16,7 @@ from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.knn_distances import knn_distances
 from blitzgs.ops.photometric import photometric_fwd_bwd, photometric_loss, pixel_counts, ssim
 from blitzgs.ops.population import MAX_COPIES, overlap, position_noise_
-from blitzgs.util.errors import check_tensor, warn
+from blitzgs.util.errors import check_tensors, warn
 from blitzgs.util.rotations import quaternion_matrices
 
 _TRIANGLE = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))
@@ -39,8 +39,10 @@ def quat_scale_to_covar_preci(
         Two of [..., 3, 3], or None for what is not wanted.
 
     Raises:
+        TypeError: an argument is not a tensor.
         ValueError: a shape does not fit.
     """
+    check_tensors(quats=quats, scales=scales)
     if quats.shape[-1:] != (4,) or scales.shape != (*quats.shape[:-1], 3):
         raise ValueError(
             f"quats must be [..., 4] and scales [..., 3], got {list(quats.shape)} and {list(scales.shape)}"
@@ -76,8 +78,9 @@ def relocate(
 
     Raises:
         ValueError: a shape does not fit.
-        TypeError: `min_opacity` is a table.
+        TypeError: an argument is not a tensor, or `min_opacity` is a table.
     """
+    check_tensors(opacities=opacities, scales=scales, ratios=ratios)
     if opacities.dim() != 1 or scales.shape != (len(opacities), 3) or ratios.shape != opacities.shape:
         raise ValueError(
             f"opacities and ratios must be [N] and scales [N, 3], got {list(opacities.shape)}, "
@@ -124,8 +127,7 @@ def position_noise(
         TypeError: an argument is not a tensor.
         RuntimeError, ValueError: wrong shapes or dtypes.
     """
-    for name, value in (("quats", quats), ("scales", scales), ("opacities", opacities)):
-        check_tensor(name, value)
+    check_tensors(quats=quats, scales=scales, opacities=opacities)
     if opacities.numel() != len(quats):
         raise ValueError(
             f"opacities must be [N] or [N, 1] with N = {len(quats)}, got {list(opacities.shape)}"
@@ -157,7 +159,7 @@ def knn(points: Tensor, k: int) -> Tensor:
         TypeError: `points` is not a tensor.
         RuntimeError: wrong shape or dtype, or k outside its range.
     """
-    check_tensor("points", points)
+    check_tensors(points=points)
     return knn_distances(points, k)
 
 

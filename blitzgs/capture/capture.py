@@ -208,7 +208,7 @@ def _check_options(downscale: float, exif: str, undistort: str, stray_cameras: s
 
 
 def _headers(views: list[SourceView]) -> list[ImageHeader]:
-    """Read the headers of the photographs and check their masks; warn of bands that are not used."""
+    """Read the headers of the photographs and check their masks; warn of unused or misleading bands."""
     headers = in_threads(read_header, [view.path for view in views])
     check_masks([view.mask_path for view in views])
     extra_bands = [view.name for view, header in zip(views, headers, strict=True) if header.extra_bands]
@@ -216,6 +216,12 @@ def _headers(views: list[SourceView]) -> list[ImageHeader]:
         warn(
             f"{len(extra_bands)} of {len(views)} photographs have a further band that their file does not "
             f"call alpha (first: {extra_bands[0]}), near infrared for example; it is not used"
+        )
+    grey = [view.name for view, header in zip(views, headers, strict=True) if header.is_grey]
+    if 0 < len(grey) < len(views):
+        warn(
+            f"{len(grey)} of {len(views)} photographs are grey (first: {grey[0]}), and the model will be "
+            "grey in part: leave out the bands of a multispectral camera"
         )
     return headers
 

@@ -159,7 +159,8 @@ def read_model(folder: Path | str, *, points2d: bool = False, tracks: bool = Fal
     if paths is None:
         suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
         lost = next(path for path in _files(folder, suffix).values() if not path.is_file())
-        raise FileNotFoundError(f"{lost} is missing: {folder} is not a complete COLMAP sparse model")
+        instead = "" if lost.stem != "points3D" else f"; points of another program can be in {lost.stem}.ply"
+        raise FileNotFoundError(f"{lost} is missing: {folder} is not a complete COLMAP sparse model{instead}")
     cameras = [ColmapCamera(*row) for row in native.read_cameras(os.fsencode(paths["cameras"]))]
     images, points = native.read_images(os.fsencode(paths["images"]), points2d), ColmapPoints()
     if paths["points3D"].suffix not in POINT_SUFFIXES:

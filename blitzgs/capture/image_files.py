@@ -51,13 +51,14 @@ class ImageFile(NamedTuple):
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """The stored size (pixels), the EXIF orientation (1 to 8), whether there is alpha, and unused bands."""
+    """The stored size (pixels), the EXIF orientation (1 to 8), and what its bands are."""
 
     width: int
     height: int
     orientation: int = 1
     has_alpha: bool = False
     extra_bands: int = 0
+    is_grey: bool = False
 
 
 def in_threads(call: Callable[[T], R], files: Iterable[T]) -> list[R]:
@@ -88,7 +89,8 @@ def read_header(path: Path) -> ImageHeader:
     if header["format"] not in _HEADERS_WITH_SIZE:
         pixels = _imdecode(found, cv2.IMREAD_UNCHANGED)
         height, width = pixels.shape[:2]
-    return ImageHeader(width, height, header["orientation"], bool(header["alpha"]), header["extras"])
+    is_grey = header["colors"] == 1
+    return ImageHeader(width, height, header["orientation"], bool(header["alpha"]), header["extras"], is_grey)
 
 
 def described(data: bytes | UInt8, name: str, header: dict[str, Any] | None = None) -> ImageFile:

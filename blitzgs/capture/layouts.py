@@ -25,6 +25,8 @@ from blitzgs.util.errors import located, warn
 
 # What programs write beside the images of a synthetic capture.
 _BY_PRODUCT = re.compile(rf"(?i)({BY_PRODUCTS})s?(_?\d+)?$")
+# How far entries of an image's rotation in two models of one world may be apart.
+_SAME_TURN = 0.05
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,7 @@ def read_layout(
     elif folder is not None:
         read = [_read_colmap(root, model, images, downscale) for model in models]
         views, points = read[0] if len(read) == 1 else _joined(read)
+        notes += [note for model in models for note in _of_other_kind(root, model)]
         shown = " and ".join(str(model.relative_to(root)) for model in models if model != root)
         about = About(shown or "cameras, images and points3D", "", tuple(notes))
     elif "train" in parts:
@@ -146,9 +149,28 @@ def _models(root: Path, sparse: str) -> tuple[list[Path], list[str]]:
     return [models[0][0]], [note]
 
 
+def _of_other_kind(root: Path, model: Path) -> list[str]:
+    """Return a line if a model has files of both kinds, of which one is read: the others may be newer."""
+    read = (colmap.complete_files(model) or {})["images"]
+    other = read.with_suffix(".txt" if read.suffix == ".bin" else ".bin")
+    shown = relative_to(root, read)
+    return [f"{shown} is read, and {other.name} beside it not"] if other.is_file() else []
+
+
 def _joined(parts: list[tuple[list[SourceView], SourcePoints]]) -> tuple[list[SourceView], SourcePoints]:
-    """Return the views and points of several models; of an image in two of them, the first counts."""
-    views = {view.name: view for found, _ in reversed(parts) for view in found}
+    """Return the views and points of several models; of an image in two of them, the first counts.
+
+    ValueError: such an image looks elsewhere in the second, so that their worlds are not the same.
+    """
+    views: dict[str, SourceView] = {}
+    for view in (view for found, _ in parts for view in found):
+        known = views.setdefault(view.name, view)
+        ours, theirs = (each.world_to_camera[:3, :3] for each in (known, view))
+        if not np.allclose(ours, theirs, atol=_SAME_TURN, equal_nan=True):
+            raise ValueError(
+                f"data.sparse: {view.name} is in two COLMAP models and looks elsewhere in the second: their "
+                "worlds are not the same; name one model, or align them first (colmap model_merger)"
+            )
     columns = [points.columns() for _, points in parts]
     common = [name for name in columns[0] if all(name in others for others in columns)]
     joined: dict[str, Any] = {name: np.concatenate([each[name] for each in columns]) for name in common}
@@ -203,8 +225,9 @@ def _read_colmap(
     root: Path, folder: Path, images: str, downscale: float, part: str = ""
 ) -> tuple[list[SourceView], SourcePoints]:
     model = colmap.read_model(folder)
+    used = set(model.images.camera_ids.tolist())
     with located(str(folder)):
-        lenses = lenses_of(model.cameras)
+        lenses = lenses_of([camera for camera in model.cameras if camera.id in used])
     names = model.images.names
     if len(set(names)) < len(names):
         twice = next(name for name, count in Counter(names).items() if count > 1)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -47,8 +48,8 @@ class StrayCamera:
     others: float  # largest such distance of the cameras that are together
 
 
-def sampled(points: Float64, views: int) -> Float64:
-    """Return so many of the points, evenly chosen, that all views can be compared with them quickly."""
+def sampled(points: npt.NDArray[Any], views: int) -> npt.NDArray[Any]:
+    """Return so many of the points [M, 3], or colours, that all views can be compared with them quickly."""
     count = max(_LEAST_POINTS, _PAIRS // max(1, views))
     return points[:: max(1, -(-len(points) // count))]
 
@@ -98,14 +99,20 @@ def _shown(view: SourceView, points: Float64) -> float:
     return float(spans.max())
 
 
+def points_seen(camera: Camera, points: Float64) -> tuple[npt.NDArray[np.int64], Float64]:
+    """Return which re-centred points [M, 3] a camera sees, occluded ones too, and x, y, depth [3, S]."""
+    x, y, depth = camera.world_to_camera[:3, :3] @ points.T + camera.world_to_camera[:3, 3:]
+    front = np.flatnonzero(depth > 0)
+    x, y, depth = x[front], y[front], depth[front]
+    x = camera.K[0, 0] * x / depth + camera.K[0, 2]
+    y = camera.K[1, 1] * y / depth + camera.K[1, 2]
+    inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return front[inside], np.stack([x, y, depth])[:, inside]
+
+
 def depths_seen(camera: Camera, points: Float64) -> Float64:
     """Return the depths of the re-centred points [M, 3] that a camera sees, occluded ones too, unordered."""
-    x, y, depth = camera.world_to_camera[:3, :3] @ points.T + camera.world_to_camera[:3, 3:]
-    front = depth > 0
-    x, y, depth = x[front], y[front], depth[front]
-    u = camera.K[0, 0] * x / depth + camera.K[0, 2]
-    v = camera.K[1, 1] * y / depth + camera.K[1, 2]
-    return np.asarray(depth[(u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)])
+    return np.asarray(points_seen(camera, points)[1][2])
 
 
 def nearest_depths(cameras: Sequence[Camera], points: Float64) -> Float64:

@@ -112,6 +112,11 @@ def lenses_of(cameras: Sequence[ColmapCamera]) -> dict[int, Lens]:
     return lenses
 
 
+# By how much of the image's sides the principal point may be off its middle. It is farther off if the image
+# has become 1.4 times smaller or two times larger and the lens is still that of before.
+_OFF_CENTRE = 0.2
+
+
 def check_lens(lens: Lens) -> str:
     """Return what is unusual about a lens, or an empty text.
 
@@ -136,6 +141,8 @@ def check_lens(lens: Lens) -> str:
         return f"principal point {cx:g}, {cy:g} at the corner {where} (it is given in pixels)"
     if not (0 <= cx <= lens.width and 0 <= cy <= lens.height):
         return f"principal point {cx:g}, {cy:g} outside an image of {lens.width} x {lens.height} pixels"
+    if max(abs(cx / lens.width - 0.5), abs(cy / lens.height - 0.5)) > _OFF_CENTRE:
+        return f"principal point {cx:g}, {cy:g} far from the middle {where}: was the image resized?"
     return ""
 
 

@@ -27,6 +27,8 @@ _VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mts", ".insv", ".36
 # How folders and files are called that belong to photographs and have their names, but show something else.
 BY_PRODUCTS = "depth|normal|disp|mask|alpha|segmentation|semantic"
 _BY_PRODUCT = re.compile(rf"(?i)(^|/)({BY_PRODUCTS})[^/]*/")
+# Folders that systems make beside photographs: small copies of them on network storage, and deleted ones.
+_OF_SYSTEMS = ("@eadir", "__macosx", "#recycle", "$recycle.bin")
 # Of folders in each other.
 _DEEPEST = 8
 
@@ -133,13 +135,13 @@ def _is_alike(name: str, file: str) -> bool:
 def files_below(folder: Path) -> list[str]:
     """Return the files of a folder and its subfolders, sorted, as paths relative to it with slashes.
 
-    Hidden ones are left out, as macOS writes them beside photographs. Links are followed, but none to a
-    folder that has the link inside, which would repeat all.
+    Hidden ones are left out, as macOS writes them beside photographs, and folders of network storage and
+    recycle bins. Links are followed, but none to a folder that has the link inside, which would repeat all.
     """
     out = []
     for place, folders, files in os.walk(folder, followlinks=True):
         inside = f"{os.path.realpath(place)}/"
-        shown = (name for name in folders if not name.startswith("."))
+        shown = (n for n in folders if not n.startswith(".") and n.lower() not in _OF_SYSTEMS)
         folders[:] = sorted(n for n in shown if not inside.startswith(f"{os.path.realpath(f'{place}/{n}')}/"))
         if len(Path(place).relative_to(folder).parts) > _DEEPEST:  # links that lead to each other
             folders.clear()

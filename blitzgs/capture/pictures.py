@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.capture.image_files import UInt8
-from blitzgs.util.errors import check_tensor
+from blitzgs.util.errors import check_tensors
 from blitzgs.util.output import write_file
 
 # The error that the last colour of an error map shows.
@@ -39,7 +39,7 @@ def save_image(path: Path | str, image: Tensor) -> None:
         TypeError: the image is not a tensor.
         ValueError: the format is not known, or the image has another shape or values that are NaN.
     """
-    check_tensor("image", image)
+    check_tensors(image=image)
     if bool(image.isnan().any()):
         raise ValueError(
             f"image has NaN in {int(image.isnan().sum()):,} of {image.numel():,} values: black in a file"

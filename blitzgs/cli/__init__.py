@@ -15,7 +15,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Container, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from types import FrameType
@@ -75,6 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             status = _run(given)
         except SystemExit as ending:  # argparse's, after a help or a wrong usage
+            if ending.code:
+                _tell_other_ranks("wrong usage, which its output explains")
             raise SystemExit(report_lost(given, outputs) or ending.code) from None
         return report_lost(given, outputs) or status
 
@@ -101,6 +103,7 @@ def _run(given: list[str]) -> int:
     except Exception as error:
         from rich.console import Console
 
+        _tell_other_ranks(f"{type(error).__name__}: {_message(error)}")
         # Any other error is a fault of the program and keeps its traceback.
         if not isinstance(error, (ValueError, OSError, ImportError, MemoryError, UserError)):
             raise
@@ -110,6 +113,15 @@ def _run(given: list[str]) -> int:
         console = Console(stderr=True, highlight=False, emoji=False)
         console.print(text, style="red", markup=False, soft_wrap=True)
         return 1
+
+
+def _tell_other_ranks(message: str) -> None:
+    """Publish why this process fails, if others of a job may wait for it to join them."""
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        with suppress(Exception):  # the job's store may have ended, and torch may be what failed
+            from blitzgs.distributed.watchdog import report_early_failure
+
+            report_early_failure(message)
 
 
 def _arguments(parser: Parser, chosen: str, given: list[str]) -> argparse.Namespace:

@@ -9,16 +9,14 @@ import sys
 from pathlib import Path
 
 from blitzgs.cli import arguments
-from blitzgs.config.fields import Config, DataConfig, ModelConfig
 from blitzgs.config.files import changed
 from blitzgs.distributed.group import Ranks
-from blitzgs.formats.gaussians import is_antialiased
 from blitzgs.formats.models import read_gaussians
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files, trained_model
 from blitzgs.runs.cameras import input_files, warn_of_changes
 from blitzgs.runs.evaluation import evaluate, load_lpips, worst_views
-from blitzgs.runs.world import check_seen, subject_of_file
+from blitzgs.runs.world import check_seen, config_of_file, subject_of_file
 from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.training.understood import largest_size
 from blitzgs.util.errors import printable
@@ -70,10 +68,8 @@ def run(args: argparse.Namespace) -> None:
             found = read_gaussians(path)
             if args.data is None:
                 raise ValueError("a file is compared with a capture: add --data CAPTURE")
-            config = Config(
-                data=DataConfig(path=str(args.data), downscale=args.downscale or 1),
-                model=ModelConfig(antialiased=is_antialiased(found)),
-            )
+            data = {"path": str(args.data), "downscale": args.downscale or 1}
+            config = changed(config_of_file(found), "data", **data)
         else:
             if args.downscale is not None:
                 raise ValueError("--downscale is for a file: a run is measured at the size it was trained at")

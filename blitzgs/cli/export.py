@@ -18,7 +18,7 @@ import torch
 from blitzgs.cli import arguments
 from blitzgs.cli.view import photographs
 from blitzgs.distributed.group import Ranks
-from blitzgs.formats.gaussians import GaussianSource, check_memory, is_antialiased
+from blitzgs.formats.gaussians import GaussianSource, check_memory, is_antialiased, triple_of
 from blitzgs.formats.models import FORMATS, Format, check_replaces, offset_of, open_gaussians
 from blitzgs.formats.selection import Selected, Selection, read_polygon
 from blitzgs.formats.web_page import check_replaces_page
@@ -34,7 +34,7 @@ from blitzgs.runs.export import (
 )
 from blitzgs.runs.folder import Model, open_run, subject_of
 from blitzgs.runs.run_files import run_and_checkpoint
-from blitzgs.runs.source import Watched, open_source, source_of
+from blitzgs.runs.source import Watched, open_source, source_of, up_of_run
 from blitzgs.runs.world import in_world, load_world_frame
 from blitzgs.util.output import write_file
 from blitzgs.util.progress import ending_by_exception, image_progress
@@ -205,6 +205,8 @@ def _export_tiles(args: argparse.Namespace, selection: Selection | None) -> None
     )
     if beside is not None:
         print(f"coordinates are relative to ({x!r}, {y!r}, {z!r}), as {beside} says")
+    for line in FORMATS["spz"].told(written.lost):
+        print(line, file=sys.stderr)
     if args.tiles and not args.spz_tiles:
         print(f"look at it: blitzgs view {shlex.quote(str(path))}")
 
@@ -252,10 +254,11 @@ def _export_file(args: argparse.Namespace) -> None:
             written = export_file(source, kind, path)
     else:
         source, written = _export_run(args, kind, path, selection)
-    print(f"{path}: {len(source):,} Gaussians, {path.stat().st_size / 1e6:.1f} MB")
-    for line in kind.unstated(source):
+    count = len(source) - written.lost.left_out
+    print(f"{path}: {count:,} Gaussians, {path.stat().st_size / 1e6:.1f} MB")
+    for line in kind.unstated(source) + kind.told(written.lost):
         print(line, file=sys.stderr)
-    _explain(written, is_antialiased(source), kind, args)
+    _explain(written, source, kind, args)
 
 
 def _export_run(
@@ -295,7 +298,7 @@ def _export_run(
             )
             stored = folder.cameras()
             model = without_antialiasing(model, [stored.cameras[index] for index in stored.train])
-        crs = None
+        crs, up = None, up_of_run(run_folder, model.space)
         if coordinates == "world":
             frame = load_world_frame(run_folder)
             if frame is None:
@@ -303,7 +306,8 @@ def _export_run(
                     f"{run_folder} has no geo.json, so its place in the world is unknown: use blitzgs align"
                 )
             model, crs, coordinates = in_world(model, frame), frame.crs, "auto"
-    source = Selected(source_of(model), selection or Selection(), model.space.offset, kept, score)
+            up = frame.rotation @ up
+    source = Selected(source_of(model, up), selection or Selection(), model.space.offset, kept, score)
     return source, export(source, model.space, kind, path, coordinates, crs)
 
 
@@ -354,14 +358,18 @@ def _levels(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2] or match[1])
 
 
-def _explain(exported: Exported, antialiased: bool, kind: Format, args: argparse.Namespace) -> None:
-    """Print what a user of the file must know: offset, rounding, antialiasing."""
+def _explain(exported: Exported, source: GaussianSource, kind: Format, args: argparse.Namespace) -> None:
+    """Print what a user of the file must know: offset, rounding, background, antialiasing."""
     if exported.offset is not None:
         x, y, z = exported.offset
         print(f"coordinates are relative to ({x!r}, {y!r}, {z!r}), as {exported.sidecar} says")
     elif args.coordinates == "capture":
         print(f"coordinates are rounded by up to {exported.rounding:.3g}")
-    if antialiased and kind.title.endswith("PLY"):
+    background = triple_of(source.comments, "background")
+    if background is not None and any(background):
+        colour = "".join(f"{round(255 * min(max(value, 0), 1)):02x}" for value in background)
+        print(f"the model was trained over the background #{colour}: set this colour in viewers")
+    if is_antialiased(source) and kind.title.endswith("PLY"):
         print(
             "the model is antialiased (comment SplatRenderMode: mip): viewers that do not know this show it "
             "too opaque; for those, export with --classic",

@@ -253,20 +253,20 @@ def open_rendered(args: argparse.Namespace, film: Film | None, ranks: Ranks) -> 
         if args.data is not None:
             raise ValueError("--data needs the folder of a run: for a file, use --path or --cameras")
         opened = open_model(args.model, ranks)
-        subject, box = opened.subject, opened.exhibit.box
+        subject, box, up = opened.subject, opened.exhibit.box, opened.exhibit.up
         stored, exposures = None, None
     else:
         folder, checkpoint = run_files.run_and_checkpoint(args.model)
         model = trained_model.open_model(folder, ranks, args.data, args.resident_gb, checkpoint)
         exposures = model.exposures
-        box = _shared_box(model.table, ranks)
+        box, up = _shared_box(model.table, ranks), None
         stored = _stored_cameras(args, folder, model, ranks)
         subject = model.subject(ranks)
     cameras: Sequence[CameraLike]
     if args.cameras is not None:
         cameras = read_cameras(args.cameras, np.array(subject.space.offset))
     elif film is not None:
-        cameras = film.cameras(subject.space, stored.cameras if stored else (), box)
+        cameras = film.cameras(subject.space, stored.cameras if stored else (), box, up)
     elif stored is not None:
         shown = _exposures(exposures, stored) if args.exposure else {}
         indices = chosen_views(args.split, stored, args.model)

@@ -19,7 +19,7 @@ from blitzgs.runs.run_files import CONFIG
 from blitzgs.sfm.photographs import Photographs, estimate, has_photographs_alone, photograph_folder
 from blitzgs.sfm.reconstruct import MAPPERS, PAIRS, WORK, Settings, is_finished, reconstruct
 from blitzgs.sfm.refine import refine
-from blitzgs.util.errors import printable
+from blitzgs.util.errors import UserError, printable
 
 HELP = """\
 Find out where photographs were taken from, and write a capture that blitzgs train --data reads.
@@ -86,7 +86,7 @@ def with_poses(config: Config, folder: Path) -> Config:
     """Return a configuration whose capture has poses: of photographs alone they are found first.
 
     They go into `folder`, which is used as it is if it is finished. Under torchrun rank 0 finds them and the
-    others, which have not joined yet, wait for its report; where rank 0 fails, torchrun ends them.
+    others, which have not joined yet, wait for its report (UserError: a rank has failed meanwhile).
     """
     photographs = _photographs_alone(config)
     if photographs is None:
@@ -102,6 +102,10 @@ def with_poses(config: Config, folder: Path) -> Config:
         )
         find_poses(photographs, folder, Settings())
     while not is_finished(folder):
+        from blitzgs.distributed.watchdog import early_failure
+
+        if failure := early_failure():
+            raise UserError(f"there are no poses, because {failure}")
         time.sleep(1.0)
     return changed(config, "data", path=os.path.realpath(folder), images="images")
 

@@ -65,7 +65,8 @@ class DefaultStrategy(Strategy):
         prune_scale3d, prune_scale2d: after the first reset, larger Gaussians are pruned, in the same units.
         refine_scale2d_stop_iter: step from which radii do not count; 0: they never do.
         refine_start_iter, refine_stop_iter: refinement begins after the first step and ends at the second.
-        reset_every: steps between two resets of the opacities to at most twice `prune_opa`.
+        reset_every: steps between two resets of the opacities to at most twice `prune_opa`, as in gsplat's
+            main branch; a slip in the condition of 1.5.3 leaves them out.
         refine_every: steps between two refinements.
         pause_refine_after_reset: steps without refinement after each reset.
         absgrad: whether `info["means2d"].absgrad` counts (`rasterization(..., absgrad=True)`).

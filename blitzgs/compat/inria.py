@@ -38,10 +38,10 @@ class GaussianRasterizationSettings(NamedTuple):
         tanfovx, tanfovy: tangents of half the horizontal and vertical field of view.
         bg: [C], the background.
         scale_modifier: factor of the scales; `cov3D_precomp` ignores it.
-        viewmatrix: [4, 4], world to camera for row vectors: the transpose of the usual matrix. A rotation and
-            a translation.
-        projmatrix: [4, 4], world to clip space for row vectors. Its principal point counts; its focal lengths
-            must be those of tanfovx and tanfovy.
+        viewmatrix: [4, 4] or [1, 4, 4], world to camera for row vectors: the transpose of the usual matrix. A
+            rotation and a translation.
+        projmatrix: [4, 4] or [1, 4, 4], world to clip space for row vectors. Its principal point counts; its
+            focal lengths must be those of tanfovx and tanfovy.
         sh_degree: degree to evaluate, 0 to 3.
         campos: [3], the camera's centre; must fit `viewmatrix` if SH are rendered.
         prefiltered, debug: accepted, without effect.
@@ -121,6 +121,8 @@ class GaussianRasterizer(torch.nn.Module):
             shs = dc if shs is None else torch.cat([dc, shs], dim=1)
         if (shs is None) == (colors_precomp is None):
             raise ValueError("give either shs (or dc and shs) or colors_precomp, and not both")
+        if colors_precomp is not None:
+            _check_shape("colors_precomp", colors_precomp, (len(means3D), colors_precomp.shape[-1]))
         splats = _project(settings, means3D, opacities, scales, rotations, cov3D_precomp, shs)
         height, width = int(settings.image_height), int(settings.image_width)
         absolute: list[Tensor] = []
@@ -133,7 +135,8 @@ class GaussianRasterizer(torch.nn.Module):
             channels = splats.colors
         else:
             channels = colors_precomp.index_select(0, splats.gaussian_ids)
-        background = settings.bg.to(channels).view(1, -1)
+        background = settings.bg.to(channels).reshape(1, -1)
+        _check_shape("bg", background[0], channels.shape[1:])
         of_depth = self._depth_channel(splats.depths)
         if of_depth is not None:
             channels = torch.cat([channels, of_depth[:, None]], dim=1)
@@ -159,7 +162,7 @@ class GaussianRasterizer(torch.nn.Module):
     @torch.no_grad()
     def markVisible(self, positions: Tensor) -> Tensor:  # noqa: N802
         """Return which positions, [N, 3], are in front of the near plane: bool [N]."""
-        depths = self.raster_settings.viewmatrix.to(positions)[:, 2]
+        depths = self.raster_settings.viewmatrix.to(positions).reshape(4, 4)[:, 2]
         return positions @ depths[:3] + depths[3] > NEAR
 
     @torch.no_grad()
@@ -226,6 +229,13 @@ def _project(
     both = scales is not None and rotations is not None
     if both == (cov3D is not None) or (cov3D is not None and (scales is not None or rotations is not None)):
         raise ValueError("give either scales and rotations or cov3D_precomp, and not both")
+    for name, tensor, length in (
+        ("scales", scales, 3),
+        ("rotations", rotations, 4),
+        ("cov3D_precomp", cov3D, 6),
+    ):
+        if tensor is not None:
+            _check_shape(name, tensor, (len(means), length))
     unit, K = _check_settings(settings, means, rotations, sh)
     decomposed: Decomposed | None = None
     if cov3D is not None:
@@ -245,11 +255,16 @@ def _project(
         width, height, sh_degree=0 if sh is None else degree, near_plane=NEAR,
         antialiased=bool(settings.antialiasing), raw=False,
     )  # fmt: skip
-    cameras = (settings.viewmatrix.to(means).mT.contiguous()[None], K)
+    cameras = (settings.viewmatrix.to(means).reshape(1, 4, 4).mT.contiguous(), K)
     gaussians = gaussian_tensors(means, rotations, scales, opacities.reshape(-1), sh)
     inputs = ProjectionInputs(gaussians, cameras, options)
     splats = differentiable_splats(inputs, sparse_grad=False)
     return splats if decomposed is None else shaped_by(splats, inputs, decomposed)
+
+
+def _check_shape(name: str, tensor: Tensor, wanted: Sequence[int]) -> None:
+    if tensor.shape != tuple(wanted):
+        raise RuntimeError(f"{name} must be {[*wanted]}, got {[*tensor.shape]}")
 
 
 @torch.no_grad()

@@ -31,7 +31,7 @@ _TRANSPORTS: tuple[Transport, ...] = ("auto", "peer", "collective")
 DEFAULT_TIMEOUT_SECONDS = 120.0
 # The environment variables that configure torch's CUDA allocator, the present one and the one before it.
 ALLOCATOR_VARIABLES = ("PYTORCH_ALLOC_CONF", "PYTORCH_CUDA_ALLOC_CONF")
-# Start-up includes importing torch on every rank and, with NCCL, building the communicator.
+# For the first collective, before which NCCL builds the communicator.
 STARTUP_TIMEOUT_SECONDS = 300.0
 # Most ranks that can share memory.
 MAX_PEERS = 16
@@ -130,22 +130,26 @@ class Ranks:
         if self.shares_gpu:
             os.environ["TORCH_SYMM_MEM_ALLOW_OVERLAPPING_DEVICES"] = "1"
         nccl = self.device.type == "cuda" and not self.shares_gpu
-        dist.init_process_group(
-            backend="gloo" if not nccl else "cpu:gloo,cuda:nccl" if tables_on_host else "nccl",
-            store=open_store("group", self.rank == 0, STARTUP_TIMEOUT_SECONDS),
-            rank=self.rank,
-            world_size=self.world_size,
-            timeout=timedelta(seconds=STARTUP_TIMEOUT_SECONDS),
-            device_id=self.device if nccl else None,
-        )
+        self.watchdog = watchdog = Watchdog(self.rank, self.world_size, self.timeout_seconds)
+        watchdog.await_start()
+        watchdog.timeout_seconds = STARTUP_TIMEOUT_SECONDS
+        with watchdog.waiting("init_process_group"):
+            dist.init_process_group(
+                backend="gloo" if not nccl else "cpu:gloo,cuda:nccl" if tables_on_host else "nccl",
+                store=open_store("group", self.rank == 0, STARTUP_TIMEOUT_SECONDS),
+                rank=self.rank,
+                world_size=self.world_size,
+                timeout=timedelta(seconds=STARTUP_TIMEOUT_SECONDS),
+                device_id=self.device if nccl else None,
+            )
         self.barrier()
+        watchdog.timeout_seconds = self.timeout_seconds
         # The libraries' own timeouts name only a socket or an operation. The watchdog's timeout is shorter:
         # it names a rank, and it waits for ranks that are busy on their host.
         margin = 2.0 * Watchdog.period_for(self.timeout_seconds) + 10.0
         dist.distributed_c10d._set_pg_timeout(
             timedelta(seconds=max(self.timeout_seconds, BUSY_SECONDS) + margin), dist.group.WORLD
         )
-        self.watchdog = Watchdog(self.rank, self.world_size, self.timeout_seconds)
         lap("processes")
         self._choose_transport(transport, self.timeout_seconds + margin)
         lap("shared memory")

@@ -6,7 +6,8 @@ waited in a collective for long reads what the others published, and prints whic
 After the timeout it exits, or earlier if a rank no longer publishes; torchrun then ends the job. A rank that
 raises publishes its error first, so that the others print its message instead of a message about a closed
 socket; ranks that wait for it end at once. A rank that works on its host for long, for example on a slow
-disk, announces this, and the others wait for it as long as it keeps publishing.
+disk, announces this, and the others wait for it as long as it keeps publishing. All this begins before the
+ranks join: a rank that fails earlier, or never starts, is named too.
 """
 
 from __future__ import annotations
@@ -25,9 +26,11 @@ from datetime import timedelta
 import torch
 from torch.distributed import PrefixStore, TCPStore  # type: ignore[attr-defined]
 
-from blitzgs.util.errors import printable
+from blitzgs.util.errors import UserError, printable
 
 EXIT_STUCK = 75  # EX_TEMPFAIL: a restart may help
+# How long a rank waits at least for the others to start, which includes importing torch from a slow disk.
+START_SECONDS = 120.0
 # How long a rank continues to wait after another rank has reported a failure.
 GRACE_SECONDS = 4.0
 # How long a rank waits until it names those that have not arrived.
@@ -45,18 +48,44 @@ def open_store(name: str, host: bool, timeout_seconds: float) -> PrefixStore:
     new rank must not read the addresses of the rank that it replaces.
 
     `name`: name of this use of the store. `host`: whether this process serves the store if torchrun's agent
-    does not. `timeout_seconds`: for connecting and waiting.
+    does not. `timeout_seconds`: for connecting and waiting. UserError: the store cannot be had.
     """
     held_by_agent = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
-    store = TCPStore(
-        os.environ["MASTER_ADDR"],
-        int(os.environ["MASTER_PORT"]),
-        is_master=host and not held_by_agent,
-        wait_for_workers=False,
-        multi_tenant=True,
-        timeout=timedelta(seconds=timeout_seconds),
-    )
+    address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+    try:
+        store = TCPStore(
+            address,
+            port,
+            is_master=host and not held_by_agent,
+            wait_for_workers=False,
+            multi_tenant=True,
+            timeout=timedelta(seconds=timeout_seconds),
+        )
+    except RuntimeError as error:
+        raise UserError(
+            f"no way to {address}:{port} (MASTER_ADDR, MASTER_PORT) within {timeout_seconds:.0f} s: has the "
+            f"host of rank 0 started and not ended, and can it be reached? ({str(error).splitlines()[0]})"
+        ) from error
     return PrefixStore(f"blitzgs/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}/{name}", store)
+
+
+def report_early_failure(message: str) -> None:
+    """Publish why this process of a job ends, if it has not joined it yet; see `Watchdog.report_failure`."""
+    rank = int(os.environ["RANK"])
+    store = open_store("watchdog", host=rank == 0, timeout_seconds=5)
+    store.compare_set("failure", "", f"rank {rank} failed: {message}")
+    time.sleep(1.0)  # the store may end with this process: let the others read it
+
+
+def early_failure() -> str | None:
+    """Return why a process of this job has failed, for one that has not joined it yet; None: none is known.
+
+    UserError: torchrun's store has ended.
+    """
+    if os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True":
+        return None  # rank 0 serves the store, and only when it joins
+    store = open_store("watchdog", host=False, timeout_seconds=5)
+    return str(store.get("failure").decode()) if store.check(["failure"]) else None
 
 
 @dataclass(frozen=True)
@@ -101,8 +130,9 @@ class Watchdog:
         self.world_size = world_size
         self.timeout_seconds = timeout_seconds
         self.period = self.period_for(timeout_seconds)
+        self.start_seconds = max(START_SECONDS, timeout_seconds)
         # A separate connection, because the process group's may block inside a collective.
-        self.store = open_store("watchdog", host=False, timeout_seconds=30)
+        self.store = open_store("watchdog", rank == 0, self.start_seconds)
         self.lock = threading.Lock()
         self.calls = 0
         self.name = "start"
@@ -125,15 +155,38 @@ class Watchdog:
         """Return the seconds between two checks of the clock."""
         return min(2.0, timeout_seconds / 5)
 
+    def await_start(self) -> None:
+        """Wait until all ranks have made their watchdog (UserError: one has failed, or has not come)."""
+        keys = {rank: f"progress/{rank}" for rank in range(self.world_size)}
+        begin, told = time.monotonic(), False
+        while True:
+            with self.lock:
+                if self.store.check(list(keys.values())):
+                    return
+                missing = [str(rank) for rank, key in keys.items() if not self.store.check([key])]
+            if failure := self._first_failure():
+                raise UserError(f"rank {self.rank} has not begun, because {failure}")
+            waited = time.monotonic() - begin
+            text = f"has waited {waited:.0f} s for ranks that have not started: {', '.join(missing)}"
+            if waited > self.start_seconds:
+                raise UserError(
+                    f"rank {self.rank} {text}. Look for their errors in the output of their hosts; if they "
+                    "are only slow, raise ranks.timeout_seconds"
+                )
+            if waited > PATIENCE_SECONDS and not told:
+                told = True
+                print(f"rank {self.rank}: {text}", file=sys.stderr, flush=True)
+            time.sleep(0.2)
+
     @contextmanager
     def waiting(self, name: str) -> Iterator[None]:
         """Note, while the context lasts, that this rank waits for other ranks.
 
         Enter it for collectives, and to wait for this rank's device, which may itself be waiting for other
         ranks. A rank that has entered fewer of these contexts than another is called late, so all ranks must
-        enter the same ones. RuntimeError: the work in the context failed; the message names the rank that
-        caused it. If this rank is out of memory, its own `torch.OutOfMemoryError` is raised instead, and its
-        message is for the other ranks.
+        enter the same ones. UserError: the work in the context failed because of the rank that the message
+        names; RuntimeError: that rank is not known. If this rank is out of memory, its own
+        `torch.OutOfMemoryError` is raised instead, and its message is for the other ranks.
         """
         self.calls += 1
         self.name = name
@@ -144,7 +197,10 @@ class Watchdog:
             raise
         except RuntimeError as error:
             self.waiting_since = None
-            raise RuntimeError(f"{self.diagnose(name)} ({error})") from error
+            if blame := self.diagnose():
+                raise UserError(f"rank {self.rank}: {name} failed{blame}") from error
+            text = f"rank {self.rank}: {name} failed; another rank ended or lost its connection ({error})"
+            raise RuntimeError(text) from error
         finally:
             self.waiting_since = None
 
@@ -173,24 +229,21 @@ class Watchdog:
         self.stopping.set()
         self.thread.join(timeout=5)
 
-    def diagnose(self, name: str) -> str:
-        """Return a message that names the rank that broke the collective `name`, if the store has it."""
+    def diagnose(self) -> str:
+        """Return which rank broke a collective, as the end of a sentence; empty: the store does not say."""
         # The failed rank's message may not have arrived yet, and a live rank publishes within one period.
         for _ in range(10 + int(5 * self.period)):
             with suppress(RuntimeError):
                 self._listen()
-            failure = self._first_failure()
-            if failure:
-                return f"rank {self.rank}: {name} failed because {failure}"
+            if failure := self._first_failure():
+                return f" because {failure}"
             if self.stopping.wait(0.2):
                 break
         try:
             late = self._late_ranks()
         except RuntimeError:
-            return f"rank {self.rank}: {name} failed and the job's store is gone (its host process ended)"
-        if late:
-            return f"rank {self.rank}: {name} failed; {late}"
-        return f"rank {self.rank}: {name} failed; another rank ended or lost its connection"
+            return " and the job's store is gone (its host process ended)"
+        return f"; {late}" if late else ""
 
     def _first_failure(self) -> str | None:
         try:
@@ -286,8 +339,8 @@ class Watchdog:
 
     def _abort(self, reason: str) -> None:
         blame = self._first_failure() or self._late_ranks() or "no rank is known to be late"
-        message = f"rank {self.rank}: {reason}: {blame}. Ending the job."
-        print(printable(message), file=sys.stderr, flush=True)
+        message = f"{reason}: {blame}"
+        print(printable(f"rank {self.rank}: {message}. Ending the job."), file=sys.stderr, flush=True)
         self.report_failure(message)
         # The main thread is inside a collective that cannot be interrupted.
         os._exit(EXIT_STUCK)

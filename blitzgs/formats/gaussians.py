@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,7 +16,7 @@ import psutil
 import torch
 from torch import Tensor
 
-from blitzgs.util.errors import amount, check_tensor
+from blitzgs.util.errors import amount, check_tensors
 
 # Writers take so many Gaussians at a time: 62 MB at SH degree 3.
 BLOCK = 1 << 18
@@ -114,8 +116,8 @@ class Gaussians:
         shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, k, 3)}
         shapes |= {"normals": (n, 3), "levels": (n,)}
         given = self._columns()
+        check_tensors(**given)
         for name, tensor in given.items():
-            check_tensor(name, tensor)
             rows = _bad_rows(name, tensor)
             if bool(rows.any()):
                 first = int(rows.nonzero()[0])
@@ -157,6 +159,34 @@ def joined(parts: list[Gaussians]) -> Gaussians:
 def is_antialiased(source: GaussianSource) -> bool:
     """Tell whether the Gaussians are to be shown with the compensation of the screen-space blur."""
     return any(line.strip() == MIP for line in source.comments)
+
+
+def triple_line(name: str, values: Iterable[float]) -> str:
+    """Return the header line that `triple_of` reads."""
+    x, y, z = (float(value) for value in values)
+    return f"comment {name} {x!r} {y!r} {z!r}"
+
+
+def triple_of(comments: list[str], name: str) -> tuple[float, float, float] | None:
+    """Return the numbers of a header line "comment NAME X Y Z"; None: there is none.
+
+    BlitzGS writes "offset", to be added to the means; "background", the RGB in [0, 1] behind the model; and
+    "up", the upward direction.
+    """
+    for line in comments:
+        words = line.split()
+        if words[:2] == ["comment", name] and len(words) == 5:
+            with suppress(ValueError):  # another program's
+                x, y, z = (float(word) for word in words[2:])
+                if all(map(math.isfinite, (x, y, z))):
+                    return x, y, z
+    return None
+
+
+def up_of(comments: list[str]) -> tuple[float, float, float] | None:
+    """Return the upward direction that a header states; None: it states none."""
+    up = triple_of(comments, "up")
+    return up if up and any(up) else None
 
 
 def _bad_rows(name: str, tensor: Tensor) -> Tensor:

@@ -5,8 +5,8 @@ One primitive of points: POSITION, KHR_gaussian_splatting:ROTATION (unit quatern
 (linear), OPACITY (after the sigmoid), SH_DEGREE_d_COEF_n (RGB), and COLOR_0 for viewers that know only
 points. Colours are display-referred sRGB. glTF's +Y is up, so the node has the rotation that turns the
 model's up there; the coordinates themselves stay unchanged. What the format has no field for is in
-`asset.extras`: the header lines of the PLY file of the same model (antialiasing, offset, levels). Octree
-levels are the attribute _LEVEL.
+`asset.extras`: the header lines of the PLY file of the same model (antialiasing, background, offset,
+levels). Octree levels are the attribute _LEVEL.
 
 The columns follow each other, so that each is contiguous; a block of Gaussians is written into all of them.
 With KHR_gaussian_splatting_compression_spz_2, an SPZ file stands for the columns.
@@ -24,8 +24,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from blitzgs.formats.gaussians import SH_C0, Gaussians, GaussianSource, unit_quats
-from blitzgs.formats.packed import write_spz
+from blitzgs.formats.gaussians import SH_C0, Gaussians, GaussianSource, unit_quats, up_of
+from blitzgs.formats.packed import Lost, SpzGrid, write_spz
 from blitzgs.formats.partition import around
 from blitzgs.util.output import check_replaceable, new_file
 from blitzgs.util.rotations import quaternions
@@ -50,13 +50,13 @@ class _Column:
     width: int  # bytes of a Gaussian
 
 
-def write_glb(path: Path, source: GaussianSource, up: tuple[float, float, float] = COLMAP_UP) -> None:
+def write_glb(path: Path, source: GaussianSource, up: tuple[float, float, float] | None = None) -> None:
     """Write Gaussians as a GLB file; it appears under its name only when it is complete.
 
     Args:
         path: file to write, in a folder that exists. Only an empty file or a GLB is replaced.
         source: at least one Gaussian; read once, block by block.
-        up: upward direction in the coordinates of the Gaussians.
+        up: upward direction in the coordinates of the Gaussians; None: the header's, else COLMAP's.
 
     Raises:
         ValueError: there is no Gaussian, a value is not finite, or the file would exceed 4 GiB.
@@ -64,6 +64,7 @@ def write_glb(path: Path, source: GaussianSource, up: tuple[float, float, float]
         OSError: the file cannot be written, or `path` is no regular file; an existing file is unchanged.
     """
     check_replaceable(path, (b"glTF",), " and is not a GLB file")
+    up = up or up_of(source.comments) or COLMAP_UP
     count, columns = len(source), _columns(len(source), source.degree, source.has_levels)
     size = columns[-1].offset + columns[-1].width * count
     if count == 0:
@@ -93,14 +94,15 @@ def write_glb(path: Path, source: GaussianSource, up: tuple[float, float, float]
         file.write(_head(_json(source, columns, size, box, up).ljust(room), size))
 
 
-def write_spz_glb(path: Path, model: Gaussians) -> None:
+def write_spz_glb(path: Path, model: Gaussians, grid: SpzGrid) -> Lost:
     """Write Gaussians whose up is +Z as a GLB with an SPZ file inside, as CesiumJS 1.144 reads it.
 
     It reads no rotation of the node, only a matrix, and stops at accessors of opacities and of SH degree 0,
-    which SPZ's decoder gives as COLOR_0. ImportError: gsply is missing. ValueError, OSError: as `write_glb`.
+    which SPZ's decoder gives as COLOR_0. `grid` has room for all positions. ImportError: gsply is missing.
+    ValueError, OSError: as `write_glb`.
     """
     model.check()
-    write_spz(packed := path.with_suffix(".spz"), model)
+    lost = write_spz(packed := path.with_suffix(".spz"), model, grid)
     data = packed.read_bytes()
     packed.unlink()
     means = model.means.double().numpy() * [1.0, -1.0, -1.0]
@@ -111,6 +113,7 @@ def write_spz_glb(path: Path, model: Gaussians) -> None:
     text, data = text.ljust(-(-len(text) // 4) * 4), data.ljust(-(-len(data) // 4) * 4, b"\0")
     with new_file(path) as partial:
         partial.write_bytes(_head(text, len(data)) + data)
+    return lost
 
 
 def _head(text: bytes, size: int) -> bytes:
@@ -180,8 +183,9 @@ def _json(
         "attributes": {column.name: i for i, column in enumerate(columns)},
         "extensions": {EXTENSION: extension},
     }
+    comments = [line.encode("utf-8", "replace").decode() for line in source.comments]  # JSON is UTF-8
     content: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "BlitzGS", "extras": {"comments": source.comments}},
+        "asset": {"version": "2.0", "generator": "BlitzGS", "extras": {"comments": comments}},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],

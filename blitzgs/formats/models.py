@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from blitzgs.formats import packed
-from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased
+from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased, triple_line, triple_of
 from blitzgs.formats.glb import write_glb
 from blitzgs.formats.ply import PlySource, read_ply, save_ply
 from blitzgs.formats.sog import read_sog, write_sog
@@ -28,15 +28,13 @@ class Format:
     title: str  # what it is
     suffix: str  # end of its files' names
     read: Callable[[Path], Gaussians] | None  # reads a file whole; None: it is not read
-    # Writes a file block by block; it appears under its name only when it is complete.
-    write: Callable[[Path, GaussianSource], None]
+    # Writes a file block by block; it appears under its name only when it is complete. None: nothing is lost.
+    write: Callable[[Path, GaussianSource], packed.Lost | None]
     starts: tuple[bytes, ...] = ()  # how its files begin, of which one is true; empty: nothing tells
     states: tuple[str, ...] = ()  # what its viewers find in the file besides the Gaussians
     harmonics: bool = True  # whether it holds SH coefficients beyond the DC
     quantised: bool = True  # whether positions are finer near the origin than float32 makes them
-    # Tells which Gaussians its ranges change, bool [N]; and how it changes them.
-    cut: Callable[[Gaussians], torch.Tensor] | None = None
-    cut_to: str = ""
+    ranges: str = ""  # to which `write` cuts values
 
     def unstated(self, source: GaussianSource) -> list[str]:
         """Return what a viewer of the file will not know of a model, each a sentence without a full stop."""
@@ -50,9 +48,19 @@ class Format:
             lost.append(f"{self.title} has no octree levels: viewers show all Gaussians")
         if source.degree > 0 and not self.harmonics:
             lost.append(f"{self.title} holds one colour a Gaussian: colours that depend on the view are lost")
-        if self.cut is not None and (count := sum(int(self.cut(block).sum()) for block in source.blocks())):
-            lost.append(f"{self.title} holds {self.cut_to}: {count:,} Gaussians became smaller or darker")
         return lost
+
+    def told(self, lost: packed.Lost) -> list[str]:
+        """Return what `write` has lost, each a sentence without a full stop."""
+        lines = []
+        if lost.cut:
+            lines.append(f"{self.title} holds {self.ranges}: {lost.cut:,} Gaussians were cut to that")
+        if lost.left_out:
+            lines.append(
+                f"{lost.left_out:,} Gaussians were left out: so far away that {self.title} would round the "
+                "positions of all others"
+            )
+        return lines
 
 
 # By the name of the flag of `blitzgs export`.
@@ -64,10 +72,13 @@ FORMATS = {
         "compressed PLY", ".ply", packed.read_compressed_ply, packed.write_compressed_ply, (b"ply",),
         ("antialiasing", "offset"),
     ),
-    "splat": Format(".splat", ".splat", packed.read_splat, packed.write_splat, harmonics=False),
+    "splat": Format(
+        ".splat", ".splat", packed.read_splat, packed.write_splat,
+        harmonics=False, ranges="colours up to white",
+    ),
     "spz": Format(
         "SPZ", ".spz", packed.read_spz, packed.write_spz, (b"\x1f\x8b", b"NGSP"), ("antialiasing",),
-        cut=packed.cut_by_spz, cut_to="scales to 379 units and colours to 1.44 of white",
+        ranges="scales of 0.000045 to 379 units, colours to 1.44 of white and SH coefficients to 1",
     ),
     "sog": Format("SOG", ".sog", read_sog, write_sog, (b"PK",), ("antialiasing",)),
     "glb": Format("GLB", ".glb", None, write_glb, (b"glTF",), ("levels",), quantised=False),
@@ -124,7 +135,7 @@ def read_gaussians(path: Path | str) -> Gaussians:
     with located(str(path)):
         found.check()
     if "offset" not in kind.states and (offset := stated_offset(offset_file(path))):
-        found.comments = [*found.comments, offset_line(offset)]
+        found.comments = [*found.comments, triple_line("offset", offset)]
     return found
 
 
@@ -151,16 +162,6 @@ def stated_offset(path: Path) -> tuple[float, float, float] | None:
     return (x, y, z) if {"file", "meaning"} <= content.keys() else None
 
 
-def offset_line(offset: tuple[float, float, float]) -> str:
-    """Return the header line that `offset_of` reads."""
-    return "comment offset {!r} {!r} {!r}".format(*offset)
-
-
 def offset_of(comments: list[str]) -> tuple[float, float, float]:
     """Return the offset that `blitzgs export` writes into a header; zero: there is none."""
-    for line in comments:
-        words = line.split()
-        if words[:2] == ["comment", "offset"] and len(words) == 5:
-            x, y, z = (float(word) for word in words[2:])
-            return x, y, z
-    return 0.0, 0.0, 0.0
+    return triple_of(comments, "offset") or (0.0, 0.0, 0.0)

@@ -8,6 +8,8 @@ free memory before it sees it. It writes, and reads SPZ.
 from __future__ import annotations
 
 import gzip
+import math
+import os
 import re
 import shutil
 import struct
@@ -16,7 +18,7 @@ import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -51,6 +53,13 @@ _BOUNDS, _WORDS = ("x y z", "scale_x scale_y scale_z", "r g b"), ("position", "r
 _HALF_TURN = torch.tensor([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=torch.float32)
 
 Floats = npt.NDArray[np.float32]
+
+
+class Lost(NamedTuple):
+    """Numbers of Gaussians that a writer did not keep as they are."""
+
+    cut: int = 0  # beyond the ranges of the format, and cut to them
+    left_out: int = 0  # so far away that the positions of the others would be rounded
 
 
 def _gsply() -> Any:
@@ -120,7 +129,7 @@ def write_compressed_ply(path: Path, source: GaussianSource) -> None:
     count, rest, first = len(source), _rest(source.degree), 0
     chunks, lines = -(-count // _CHUNK), _layout(count, len(_BOUNDS), source.degree)
     with new_file(path) as partial, open(partial, "r+b") as file:
-        begin = file.write("\n".join([*lines[:2], *source.comments, *lines[2:], "end_header\n"]).encode())
+        begin = file.write(os.fsencode("\n".join([*lines[:2], *source.comments, *lines[2:], "end_header\n"])))
         for block in unit_blocks(source):
             content: bytes = _gsply().compress_to_bytes(_gsdata(block))
             own = (first // _CHUNK, -(-len(block) // _CHUNK), chunks, _CHUNK_BYTES)
@@ -154,7 +163,7 @@ def read_compressed_ply(path: Path) -> Gaussians:
     header, found, _ = start.partition(b"end_header\n")
     if not found:
         raise ValueError(f"{path}: the header of the PLY file does not end")
-    lines = header.decode("ascii", "replace").splitlines()
+    lines = os.fsdecode(header.replace(b"\r", b"")).split("\n")[:-1]
     comments = [line for line in lines if line.startswith(("comment ", "obj_info "))]
     layout = [line.strip() for line in lines if line not in comments]
     elements = {
@@ -231,16 +240,20 @@ def _unpack(
 _SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
 
 
-def write_splat(path: Path, source: GaussianSource) -> None:
+def write_splat(path: Path, source: GaussianSource) -> Lost:
     """Write a .splat file block by block; it holds no SH coefficients beyond the DC."""
+    cut = 0
     with new_file(path) as partial, open(partial, "wb") as file:
         for block in unit_blocks(source):
             rows = np.zeros(len(block), dtype=_SPLAT)
             rows["mean"], rows["scale"] = block.means.numpy(), block.scales.exp().numpy()
             shade = torch.cat([0.5 + SH_C0 * block.sh[:, 0], block.opacities.sigmoid()[:, None]], dim=1)
+            # Viewers show a negative colour as black, but one above white brightens what lies before it.
+            cut += int((shade > 1 + 0.5 / 255).any(dim=1).sum())
             rows["color"] = (shade.clamp(0, 1) * 255).round().numpy()
             rows["quat"] = (block.quats * 128 + 128).round().clamp(0, 255).numpy()
             file.write(rows.data)
+    return Lost(cut)
 
 
 def read_splat(path: Path) -> Gaussians:
@@ -273,23 +286,59 @@ def read_splat(path: Path) -> Gaussians:
 # --- SPZ: fixed-point columns, deflated; y is up: half a turn about x from PLY files ---
 
 
-def write_spz(path: Path, source: GaussianSource) -> None:
+class SpzGrid(NamedTuple):
+    """The positions that an SPZ file can say: 24 bits and a sign, of which some are a fraction."""
+
+    bits: int  # of the fraction
+    held: int  # number of Gaussians whose positions have room
+
+    @classmethod
+    def of(cls, source: GaussianSource) -> SpzGrid:
+        """Choose the fraction for a model (ValueError: as `unit_blocks`, or no position has room)."""
+        middles, exponents = [], torch.zeros(_EXPONENTS, dtype=torch.int64)
+        for block in unit_blocks(source):
+            exponents += torch.bincount(_exponents(block), minlength=_EXPONENTS)
+            middles.append(block.scales.median(dim=1).values)
+        count, counts = len(source), exponents.cumsum(dim=0)
+        if not counts[22]:
+            raise ValueError(f"SPZ holds coordinates up to {1 << 22:,}, and those of the model are larger")
+        holds_all = 23 - int((counts < count).sum())
+        # A range of eight times where 99 % are, or all but one.
+        holds_most = 20 - int((counts < max(0.9 * count, min(0.99 * count, count - 1))).sum())
+        # The step shall be a 16th of the median Gaussian, if the range permits; far Gaussians may not make it
+        # larger than a quarter, from where on the picture shows it.
+        middle = float(torch.cat(middles).median().clamp(-15, 15).exp())
+        fine, coarse = (math.ceil(math.log2(parts / middle)) for parts in (16, 4))
+        bits = max(1, min(max(fine, 12), holds_all), min(coarse, holds_most))
+        return cls(bits, int(counts[23 - bits]))
+
+    def holds(self, model: Gaussians) -> torch.Tensor:
+        """Tell which positions have room, bool [N]."""
+        return _exponents(model) <= 23 - self.bits
+
+
+# Coordinates below 1 count as 1, and float32 ends at 2^128.
+_EXPONENTS = 129
+
+
+def _exponents(model: Gaussians) -> torch.Tensor:
+    """Return the least e for which all coordinates are below 2^e, int64 [N]."""
+    return torch.frexp(model.means.abs().amax(dim=1)).exponent.clamp(min=0).long()
+
+
+def write_spz(path: Path, source: GaussianSource, grid: SpzGrid | None = None) -> Lost:
     """Write an SPZ file of version 3; readers from before the end of 2025 may know 2 alone.
 
-    The model is read twice, block by block; a temporary file in the same folder holds the columns.
+    The model is read twice, block by block, once if the grid is given; a temporary file in the same folder
+    holds the columns. Gaussians too far away for the grid are left out.
     """
-    count, largest, middles = len(source), 1e-3, []
-    for block in unit_blocks(source):
-        largest = max(largest, float(block.means.abs().max()))
-        middles.append(block.scales.median(dim=1).values)
-    # Positions have 24 bits. The step shall be a 16th of the median Gaussian or less, if the range permits.
-    middle = float(torch.cat(middles).median().clamp(-15, 15).exp())
-    bits = int(np.clip(np.ceil(np.log2(16 / middle)), 12, 24))
-    bits = max(1, min(bits, int(np.floor(np.log2((2**23 - 1) / largest)))))
-    widths, first = (9, 1, 3, 3, 4, _rest(source.degree)), 0
+    grid = grid or SpzGrid.of(source)
+    count, widths, first, cut = grid.held, (9, 1, 3, 3, 4, _rest(source.degree)), 0, 0
     with new_file(path) as partial, tempfile.TemporaryFile(dir=path.parent) as file:
-        for block in unit_blocks(source):
-            _gsply().write_spz(partial, _gsdata(_half_turn(block)), fractional_bits=bits)
+        for every in unit_blocks(source):
+            block = every.rows(grid.holds(every))
+            cut += int(_cut_by_spz(block).sum())
+            _gsply().write_spz(partial, _gsdata(_half_turn(block)), fractional_bits=grid.bits)
             content = gzip.decompress(partial.read_bytes())
             if first == 0:
                 flags = content[14] | (_SPZ_ANTIALIASED if is_antialiased(source) else 0)
@@ -300,11 +349,14 @@ def write_spz(path: Path, source: GaussianSource) -> None:
         file.seek(0)
         with open(partial, "wb") as target, gzip.GzipFile("", "wb", 6, target, mtime=0) as packed:
             shutil.copyfileobj(file, packed, 1 << 20)
+    return Lost(cut, len(source) - count)
 
 
-def cut_by_spz(model: Gaussians) -> torch.Tensor:
-    """Tell which Gaussians are larger or brighter than the bytes of SPZ can say, bool [N]."""
-    return (model.scales > 255.5 / 16 - 10).any(dim=1) | (model.sh[:, 0] > 0.5 / 0.15).any(dim=1)
+def _cut_by_spz(model: Gaussians) -> torch.Tensor:
+    """Tell which Gaussians have scales, colours or SH coefficients that SPZ's bytes cannot say, bool [N]."""
+    longest, bright = model.scales.amax(dim=1), (model.sh[:, 0] > 0.5 / 0.15).any(dim=1)
+    shiny = (model.sh[:, 1:].abs() > 1).flatten(1).any(dim=1)
+    return (longest > 255.5 / 16 - 10) | (longest < -0.5 / 16 - 10) | bright | shiny
 
 
 def read_spz(path: Path) -> Gaussians:

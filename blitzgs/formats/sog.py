@@ -27,6 +27,8 @@ from blitzgs.formats.gaussians import (
     GaussianSource,
     check_memory,
     is_antialiased,
+    triple_line,
+    triple_of,
     with_largest,
     without_largest,
 )
@@ -78,7 +80,7 @@ def write_sog(path: Path, source: GaussianSource) -> None:
             codes["shN_labels"][rows] = np.stack([named & 255, named >> 8], axis=1)
     meta: dict[str, Any] = {
         "version": 2,
-        "asset": {"generator": "BlitzGS"},
+        "asset": {"generator": "BlitzGS", "comments": _view_lines(source.comments)},
         "count": count,
         "antialias": is_antialiased(source),
         "means": {"mins": least.tolist(), "maxs": most.tolist(), "files": []},
@@ -323,14 +325,21 @@ def _decoded(path: Path, archive: zipfile.ZipFile, meta: dict[str, Any], count: 
             raise ValueError(f"{path}: the palette of shN has {entries.shape[1]} x {len(entries)} pixels")
         palette = values("shN", entries[..., :3].reshape(-1, 3)).reshape(size, k, 3)
         sh = np.concatenate([sh, palette[named]], axis=1)
+    comments = [line for line in meta.get("asset", {}).get("comments", []) if isinstance(line, str)]
     return Gaussians(
         means=torch.from_numpy(means),
         quats=with_largest(turns[:, :3] / np.float32(255), turns[:, 3] - 252),
         scales=torch.from_numpy(values("scales", codes("scales")[:, :3])),
         opacities=opacities,
         sh=torch.from_numpy(sh),
-        comments=[MIP] if meta.get("antialias", False) else [],
+        comments=[*([MIP] if meta.get("antialias", False) else []), *_view_lines(comments)],
     )
+
+
+def _view_lines(comments: list[str]) -> list[str]:
+    """Return the header lines with background and upward direction, for which the format has no field."""
+    stated = {name: triple_of(comments, name) for name in ("background", "up")}
+    return [triple_line(name, found) for name, found in stated.items() if found is not None]
 
 
 def _webp_size(data: bytes, where: str) -> tuple[int, int]:

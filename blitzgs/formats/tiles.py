@@ -34,6 +34,7 @@ import torch
 
 from blitzgs.formats.gaussians import GaussianSource
 from blitzgs.formats.glb import EXTENSION, SPZ_EXTENSION, shortest_turn, write_glb, write_spz_glb
+from blitzgs.formats.packed import Lost, SpzGrid
 from blitzgs.formats.partition import BITS, Partition, Parts, around, extents
 from blitzgs.formats.proxies import Rows, merged, moments, shown
 from blitzgs.formats.web_page import WebScene, tiles_page
@@ -55,7 +56,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass
 class Tile:
-    """A node of the tree; the last three fields are known once its file is written."""
+    """A node of the tree; the last four fields are known once its file is written."""
 
     count: int  # number of Gaussians; before a tile with children is written, the largest number
     part: int = -1  # number of the leaf's part
@@ -65,6 +66,7 @@ class Tile:
     box: Array = field(default_factory=lambda: np.zeros((2, 3)))  # of what a view can show of its Gaussians
     bytes: int = 0  # size of its file
     edge: float = 0.0  # of the cells in which its Gaussians were merged; 0 for leaves
+    lost: Lost = Lost()  # what SPZ cannot hold of them
 
     def every(self) -> Iterator[Tile]:
         """Yield the tile and those below."""
@@ -83,7 +85,8 @@ class Written:
 
     tiles: int  # number of files
     bytes: int  # their size
-    gaussians: int  # number of Gaussians of the model
+    gaussians: int  # number of Gaussians of the model that are in them
+    lost: Lost = Lost()  # what SPZ cannot hold of these
 
 
 def write_tiles(
@@ -142,7 +145,9 @@ def write_tiles(
             write_file(folder / PAGE, tiles_page(title))
         write_file(folder / TILESET, json.dumps(tileset, allow_nan=False))
     tiles = list(root.every())
-    return Written(len(tiles), sum(tile.bytes for tile in tiles), len(source))
+    leaves = [tile.lost for tile in tiles if not tile.children]
+    lost = Lost(sum(some.cut for some in leaves), sum(some.left_out for some in leaves))
+    return Written(len(tiles), sum(tile.bytes for tile in tiles), len(source) - lost.left_out, lost)
 
 
 @contextmanager
@@ -250,7 +255,7 @@ def _prepare() -> None:
 
 
 def _encode_all(
-    encode: Callable[[Tile], tuple[Array, int, int, float]], root: Tile, processes: int, report: Report
+    encode: Callable[[Tile], tuple[Array, int, int, float, Lost]], root: Tile, processes: int, report: Report
 ) -> None:
     """Write all tiles, children before their parents."""
     tiles, done = sorted(root.every(), key=Tile.height), 0
@@ -258,14 +263,14 @@ def _encode_all(
         for _, level in groupby(tiles, key=Tile.height):
             same = list(level)
             for tile, found in zip(same, run(encode, same), strict=True):
-                tile.box, tile.count, tile.bytes, tile.edge = found
+                tile.box, tile.count, tile.bytes, tile.edge, tile.lost = found
                 done += 1
                 report(done, len(tiles))
 
 
-def _encode(parts: Parts, spz: bool, tile: Tile) -> tuple[Array, int, int, float]:
-    """Write the file of a tile; return its box, number of Gaussians, size, and edge of the cells."""
-    edge, folder = 0.0, parts.file.parent
+def _encode(parts: Parts, spz: bool, tile: Tile) -> tuple[Array, int, int, float, Lost]:
+    """Write the file of a tile; return its last fields, with the number of its Gaussians."""
+    edge, lost, folder = 0.0, Lost(), parts.file.parent
     if not tile.children:
         gaussians = parts.read(tile.part)
     else:
@@ -279,11 +284,14 @@ def _encode(parts: Parts, spz: bool, tile: Tile) -> tuple[Array, int, int, float
         gaussians = shown(rows, parts.comments)
     path = folder / _uri(tile)
     # glTF's up is +Y and that of 3D Tiles +Z; viewers turn contents between the two.
+    count = len(gaussians)
     if spz:
-        write_spz_glb(path, gaussians)
+        grid = SpzGrid.of(gaussians)
+        gaussians = gaussians.rows(grid.holds(gaussians))
+        lost = write_spz_glb(path, gaussians, grid)._replace(left_out=count - len(gaussians))
     else:
         write_glb(path, gaussians, up=(0.0, 0.0, 1.0))
-    return extents(gaussians), len(gaussians), path.stat().st_size, edge
+    return extents(gaussians), count, path.stat().st_size, edge, lost
 
 
 def _moments(parts: Parts, tile: Tile) -> Rows:
@@ -307,7 +315,7 @@ def _node(tile: Tile) -> tuple[dict[str, Any], Array]:
         "content": {
             "uri": _uri(tile),
             "boundingVolume": {"box": _box(tile.box)},
-            "extras": {"gaussians": tile.count},
+            "extras": {"gaussians": tile.count - tile.lost.left_out},
         },
     }
     nodes = [_node(child) for child in tile.children]

@@ -82,6 +82,15 @@ class Frame(NamedTuple):
     saved: RasterizeSaved  # the tensors that the backward pass of compositing reads
     gradients: GradientBuffer  # memory in which the gradients of the splats are summed
 
+    def over_own_background(self) -> Tensor:
+        """Return the renders over the background of the options, if views had others, [B, H, W, 3]."""
+        given = self.saved.backgrounds
+        own = _backgrounds(self.options.background, len(self.views), self.renders.device)
+        if given is own or given is None:
+            return self.renders
+        change = -given if own is None else own - given
+        return torch.addcmul(self.renders, self.saved.composited[0][..., None], change[:, None, None])
+
 
 def render_frame(
     table: GaussianTable,

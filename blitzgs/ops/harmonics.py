@@ -8,6 +8,8 @@ import math
 import torch
 from torch import Tensor
 
+from blitzgs.util.errors import check_tensors
+
 MAX_SH_DEGREE = 4
 
 
@@ -27,8 +29,14 @@ def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor
         [..., D], of the wider dtype of the two.
 
     Raises:
+        TypeError: an argument is not a tensor, or the masks are not bool.
         ValueError: the degree is not 0 to 4, or a shape does not fit.
     """
+    check_tensors(dirs=dirs, coeffs=coeffs)
+    if masks is not None:
+        check_tensors(masks=masks)
+        if masks.dtype != torch.bool:
+            raise TypeError(f"masks must be bool, got {masks.dtype}; pass masks != 0")
     if not 0 <= degree <= MAX_SH_DEGREE:
         raise ValueError(f"degree must be 0 to {MAX_SH_DEGREE}, got {degree}")
     count = (degree + 1) ** 2

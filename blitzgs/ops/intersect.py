@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs.util.errors import check_tensors
 
 
 class TileGrid(NamedTuple):
@@ -88,9 +89,13 @@ def intersect(
         past ``tile_offsets[-1]`` are undefined.
 
     Raises:
+        TypeError: an argument is not a tensor.
         RuntimeError: wrong shapes, dtypes or devices, a tile range outside the image, 2^31 splats or tiles or
             more, or more intersections than ``n_isects``.
     """
+    check_tensors(
+        means2d=means2d, conics=conics, splat_opacities=splat_opacities, depths=depths, camera_ids=camera_ids
+    )
     splats = (means2d, conics, splat_opacities, depths, camera_ids, ids)
     grid = TileGrid(n_cameras, width, height, tile_size, tile_begin, tile_end)
     return torch.ops.blitzgs.intersect(*splats, *grid, n_isects, n_splats)

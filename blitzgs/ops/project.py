@@ -21,6 +21,7 @@ from blitzgs.ops.projection_types import (
     splats_of,
 )
 from blitzgs.ops.rasterize import gradient_table_of
+from blitzgs.util.errors import check_tensors
 
 # The columns of `ProjectedSplats` that have gradients: means2d, conics, depths, opacities, colors.
 _LEARNED = slice(4, 9)
@@ -180,9 +181,11 @@ def project(
         views of the call.
 
     Raises:
+        TypeError: an argument is not a tensor.
         RuntimeError: an argument has a wrong shape, dtype or value; the message names it.
         ValueError: `sparse_grad` under `torch.compile`.
     """
+    check_tensors(means=means, quats=quats, scales=scales, opacities=opacities, viewmats=viewmats, Ks=Ks)
     if active_views is not None and active_ids is None:
         active_ids = torch.arange(len(means), dtype=torch.int32, device=means.device)
     options = ProjectionOptions(

@@ -18,6 +18,7 @@ from torch import Tensor
 from blitzgs._library import below_autograd
 from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.intersect import TileGrid, pixels_of_tiles
+from blitzgs.util.errors import check_tensors
 
 # Where the parts of a splat gradient begin in its floats (csrc/common/kernel.h), and how many these are.
 _MEAN2D, _CONIC, _OPACITY, _COLOR, _MEAN2D_ABS, SPLAT_GRADIENT = torch.ops.blitzgs.splat_gradient_layout()
@@ -95,10 +96,16 @@ def rasterize(
         Renders [B, H, W, D] and alphas [B, H, W].
 
     Raises:
+        TypeError: an argument is not a tensor.
         RuntimeError: wrong shapes or dtypes, or a tile range outside the images; on the CPU also lists of
             other splats.
         ValueError: `store_absgrad` under `torch.compile`.
     """
+    if composited is None:
+        check_tensors(
+            means2d=means2d, conics=conics, splat_opacities=splat_opacities, colors=colors,
+            isect_splats=isect_splats, tile_offsets=tile_offsets,
+        )  # fmt: skip
     splats = (means2d, conics, splat_opacities, colors, backgrounds, isect_splats, tile_offsets)
     grid = TileGrid(n_cameras, width, height, tile_size, tile_begin, tile_end)
     if torch.compiler.is_compiling():

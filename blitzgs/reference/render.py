@@ -15,6 +15,7 @@ from blitzgs.reference.projection import Splats, project_splats
 ALPHA_CUT = 1.0 / 255.0
 ALPHA_MAX = 0.99
 MIN_TRANSMITTANCE = 1e-4
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 
 
 @dataclass
@@ -165,12 +166,16 @@ def render(
         viewmat: [4, 4] world to camera.
         K: [3, 3].
         width, height, near_plane, far_plane, eps2d: as for `blitzgs.rasterization`.
-        sh_degree: degree to evaluate, or None.
+        sh_degree: degree to evaluate, 0 to 3, or None.
         background: [D] colour behind everything; None for black. Depth has none.
         render_mode: RGB, D (sum of weight times z), ED (that over alpha), RGB+D or RGB+ED.
         antialiased: compensate the opacity for the addition of eps2d.
         tolerance: see `composite`.
+
+    Raises:
+        ValueError: a shape does not fit, or the degree or the mode is not one of these.
     """
+    _check(means, quats, scales, opacities, colors, viewmat, K, sh_degree, render_mode)
     tensors: Any = (tensor.double() for tensor in (means, quats, scales, opacities, colors, viewmat, K))
     view: dict[str, Any] = dict(width=width, height=height, near_plane=near_plane, far_plane=far_plane)
     splats = project_splats(*tensors, **view, sh_degree=sh_degree, eps2d=eps2d, antialiased=antialiased)
@@ -185,6 +190,36 @@ def render(
         depth = depth / alpha[..., None].clamp(min=1e-10)
     parts = {"RGB": [rgb], "D": [depth], "ED": [depth], "RGB+D": [rgb, depth], "RGB+ED": [rgb, depth]}
     return ReferenceImage(torch.cat(parts[render_mode], dim=-1), alpha, result.cut, splats)
+
+
+def _check(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    sh_degree: int | None,
+    render_mode: str,
+) -> None:
+    if sh_degree not in (None, 0, 1, 2, 3):
+        raise ValueError(f"sh_degree must be 0 to 3 or None, got {sh_degree!r}")
+    n, channels = means.shape[:1], colors.shape[-1:]
+    count = () if sh_degree is None else (max([(sh_degree + 1) ** 2, *colors.shape[-2:-1]]),)
+    for name, tensor, shape in (
+        ("means", means, (*n, 3)),
+        ("quats", quats, (*n, 4)),
+        ("scales", scales, (*n, 3)),
+        ("opacities", opacities, n),
+        ("colors", colors, (*n, *count, *channels)),
+        ("viewmat", viewmat, (4, 4)),
+        ("K", K, (3, 3)),
+    ):
+        if tensor.shape != shape:
+            raise ValueError(f"{name} must be {[*shape]}, got {[*tensor.shape]}")
+    if render_mode not in RENDER_MODES:
+        raise ValueError(f"render_mode must be one of {', '.join(RENDER_MODES)}, got {render_mode!r}")
 
 
 @dataclass

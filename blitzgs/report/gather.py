@@ -24,7 +24,8 @@ from blitzgs.runs.checkpoint_files import DAMAGE
 from blitzgs.runs.evaluation import FOLDER, INDEX, METRICS, PARTS, preview_file
 from blitzgs.runs.folder import RunFolder, open_run
 from blitzgs.runs.world import load_world_frame
-from blitzgs.viewer.world import horizontal, up_direction
+from blitzgs.view.views import up_direction
+from blitzgs.viewer.world import horizontal
 
 T = TypeVar("T")
 Point = tuple[float, float | None, float]
@@ -187,6 +188,22 @@ def plan(data: RunData) -> dict[str, Any] | None:
         )
     measured = bool(train) and all(cameras.cameras[index].name in known for index in train)
     return {"points": points, "trained_known": measured, "unit": "m" if metres else "unit"}
+
+
+def other_cameras(first: RunCameras | None, second: RunCameras | None) -> str:
+    """Return what of a second run's cameras is not as the first's, in words; empty: all is, or unknown."""
+    if first is None or second is None:
+        return ""
+    found, other = ({camera.name: camera for camera in run.cameras} for run in (first, second))
+    held = [{run.cameras[index].name for index in run.test} for run in (first, second)]
+    both = [(found[name], other[name]) for name in found if name in other]
+    differs = {
+        "photographs": found.keys() != other.keys(),
+        "held-out views": held[0] != held[1],
+        "sizes of images": any((a.width, a.height) != (b.width, b.height) for a, b in both),
+        "poses": not all(np.allclose(a.world_to_camera, b.world_to_camera, atol=1e-6) for a, b in both),
+    }
+    return ", ".join(name for name, is_other in differs.items() if is_other)
 
 
 def _other_views(data: RunData) -> dict[str, dict[str, float]]:

@@ -25,6 +25,7 @@ from blitzgs.report import gather
 from blitzgs.report.gather import RunData, read_run
 from blitzgs.runs import run_files
 from blitzgs.runs.evaluation import METRICS
+from blitzgs.util.errors import warn
 from blitzgs.util.output import write_file
 from blitzgs.viewer.studio import open_model
 from blitzgs.viewer.web import web_file
@@ -182,6 +183,11 @@ def compare(folders: Sequence[Path]) -> str:
     names = labels(folders)
     metrics = [metric for metric in METRICS if any(metric in gather.metrics_of(run.views) for run in runs)]
     problems = [problem for run in runs for problem in run.problems]
+    for run, name in zip(runs[1:], names[1:], strict=True):
+        if differs := gather.other_cameras(runs[0].cameras, run.cameras):
+            text = f"{name} has other {differs} than {names[0]}, so that figures differ for this reason, too"
+            problems.append(f"{text}.")
+            warn(text)
     content = {
         "name": " · ".join(names),
         "subtitle": "; ".join(str(folder.resolve()) for folder in folders),

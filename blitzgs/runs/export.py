@@ -9,27 +9,29 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from blitzgs.config.files import changed
-from blitzgs.formats.gaussians import Gaussians, GaussianSource
+from blitzgs.formats.gaussians import Gaussians, GaussianSource, triple_line
 from blitzgs.formats.models import (
     Format,
     check_replaces,
     offset_file,
-    offset_line,
     offset_of,
     stated_offset,
 )
+from blitzgs.formats.packed import Lost
 from blitzgs.formats.ply import MAX_ROUNDING
 from blitzgs.runs.folder import Model
 from blitzgs.runs.source import Changed
 from blitzgs.util.output import write_file
 from blitzgs.view.views import CameraLike, Space
 
+T = TypeVar("T")
 COORDINATES = ("auto", "capture", "centred")
 
 
@@ -41,6 +43,7 @@ class Exported:
     offset: tuple[float, float, float] | None
     sidecar: Path | None  # file that has the offset
     rounding: float  # without an offset, largest rounding error of a coordinate, in the capture's unit
+    lost: Lost  # what the format cannot hold
 
 
 def export(
@@ -77,9 +80,10 @@ def export(
     if coordinates == "auto" and kind.quantised:
         centred |= float(np.linalg.norm(offset)) > 2 * space.extent * space.unit
     if centred:
-        return Exported(space.offset, _write(source, np.zeros(3), space.offset, kind.write, path, crs), 0.0)
-    _write(source, offset, None, kind.write, path)
-    return Exported(None, None, rounding)
+        sidecar, lost = _write(source, np.zeros(3), space.offset, kind.write, path, crs)
+        return Exported(space.offset, sidecar, 0.0, lost or Lost())
+    _, lost = _write(source, offset, None, kind.write, path)
+    return Exported(None, None, rounding, lost or Lost())
 
 
 def export_folder(
@@ -96,7 +100,7 @@ def export_folder(
     """
     centred = float(np.linalg.norm(offset)) > 2 * extent
     shift = np.zeros(3) if centred else np.array(offset)
-    return _write(source, shift, offset if centred else None, write, path)
+    return _write(source, shift, offset if centred else None, write, path)[0]
 
 
 def export_file(source: GaussianSource, kind: Format, path: Path) -> Exported:
@@ -113,20 +117,21 @@ def export_file(source: GaussianSource, kind: Format, path: Path) -> Exported:
             shift = np.round((low + high) / 2)
     x, y, z = (offset + shift).tolist()
     stated = (x, y, z) if offset.any() or shift.any() else None
-    return Exported(stated, _write(source, -shift, stated, kind.write, path), 0.0)
+    sidecar, lost = _write(source, -shift, stated, kind.write, path)
+    return Exported(stated, sidecar, 0.0, lost or Lost())
 
 
 def _write(
     source: GaussianSource,
     shift: npt.NDArray[np.float64],
     offset: tuple[float, float, float] | None,
-    write: Callable[[Path, GaussianSource], object],
+    write: Callable[[Path, GaussianSource], T],
     path: Path,
     crs: str | None = None,
-) -> Path | None:
-    """Write Gaussians moved by `shift`; if they are around an offset, return the file beside that states it.
+) -> tuple[Path | None, T]:
+    """Write Gaussians moved by `shift`; return the file beside, and what `write` returns.
 
-    The header states it, too.
+    If they are around an offset, header and the file beside state it; else there is none.
     """
     sidecar = offset_file(path)
     lines = [line for line in source.comments if offset_of([line]) == (0, 0, 0)]
@@ -135,22 +140,22 @@ def _write(
             raise FileExistsError(
                 f"{sidecar} exists and is not the offset of an exported model: choose another name"
             )
-        lines.append(offset_line(offset))
+        lines.append(triple_line("offset", offset))
     step = torch.from_numpy(shift)
 
     def moved(block: Gaussians) -> Gaussians:
         return replace(block, means=(block.means.double() + step).float()) if shift.any() else block
 
-    write(path, Changed(source, moved, lines))
+    found = write(path, Changed(source, moved, lines))
     if offset is None:
         # The offset of an earlier export to this name would move the model once more.
         if stated_offset(sidecar) is not None:
             sidecar.unlink()
-        return None
+        return None, found
     meaning = f"{'capture' if crs is None else 'world'} coordinates = coordinates in the file + offset"
     content = {"file": path.name, "offset": offset, "meaning": meaning}
     write_file(sidecar, json.dumps(content | ({"crs": crs} if crs else {}), indent=1))
-    return sidecar
+    return sidecar, found
 
 
 def _measured(source: GaussianSource, offset: npt.NDArray[np.float64]) -> tuple[float, float]:

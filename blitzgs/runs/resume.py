@@ -10,6 +10,7 @@ from typing import Any
 
 from blitzgs.config.fields import Config
 from blitzgs.config.files import ConfigError, flat, from_dict, load_config, to_dict
+from blitzgs.config.schedule import Schedule
 from blitzgs.runs.checkpoint import names_of
 from blitzgs.runs.checkpoint_files import DAMAGE, read_manifest
 from blitzgs.runs.run_files import CHECKPOINTS
@@ -42,12 +43,19 @@ def compare_with_file(config: Config, path: Path) -> None:
         warn(f"{path} {what}: the configuration in the checkpoint is used")
 
 
-def check_resumable(saved: Config, wanted: Config) -> None:
-    """Refuse a configuration that gives another result than the checkpoint's (ConfigError names a field)."""
+def check_resumable(saved: Config, wanted: Config, step: int) -> None:
+    """Refuse a configuration that gives another result than that of a checkpoint after `step` steps.
+
+    ConfigError: names a field.
+    """
+    # An extension that was killed before its first checkpoint has left its configuration.
+    is_finished = step >= Schedule(saved.schedule).steps
+    is_longer = is_finished and wanted.schedule.iterations > saved.schedule.iterations
     for name, old, new in _differences(saved, wanted):
         # The number of minutes may change: the rest of the run is then fitted into the rest of the new time.
         is_budget = name == "schedule.minutes" and old > 0 and new > 0
-        if not (_is_free(name) or is_budget):
+        is_longer_by = is_longer and (name == "schedule.iterations" or (name, new) == ("schedule.minutes", 0))
+        if not (_is_free(name) or is_budget or is_longer_by):
             longer = name in ("schedule.scale", "schedule.iterations", "schedule.minutes")
             remedy = ", or train a finished run longer with --extend" if longer else ""
             raise ConfigError(
@@ -68,13 +76,14 @@ def check_before_capture(folder: Path, wanted: Config, extends: bool) -> None:
         raise FileNotFoundError(f"{folder} has no checkpoint: there is no finished run to extend")
     for name in reversed(names):
         with suppress(*DAMAGE):
-            saved = from_dict(read_manifest(folder / CHECKPOINTS / name).state["config"])
+            state = read_manifest(folder / CHECKPOINTS / name).state
+            saved, step = from_dict(state["config"]), int(state["progress"]["step"])
             break
     else:
         return  # the checkpoints are damaged, which is said when one is read
     if extends:
         wanted = replace(wanted, schedule=saved.schedule)
-    check_resumable(saved, with_pace_of(decided_as(saved, wanted), saved))
+    check_resumable(saved, with_pace_of(decided_as(saved, wanted), saved), step)
 
 
 def decided_as(saved: Config, wanted: Config) -> Config:

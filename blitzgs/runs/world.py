@@ -16,9 +16,9 @@ from torch import Tensor
 from blitzgs.capture.capture import Capture
 from blitzgs.capture.lengths import nearest_depths
 from blitzgs.capture.world import GEO, WorldFrame, read_world_frame
-from blitzgs.config.fields import Config
+from blitzgs.config.fields import Config, ModelConfig
 from blitzgs.distributed.group import Ranks
-from blitzgs.formats.gaussians import Gaussians
+from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased, triple_of
 from blitzgs.formats.models import offset_of
 from blitzgs.ops.harmonics import spherical_harmonics
 from blitzgs.runs.folder import Model
@@ -149,6 +149,14 @@ def gate_of(found: Gaussians, unit: float) -> tuple[LodGate | None, float]:
     distance, fork, count, finest, smooth, least = matches[0].groups()
     gate = LodGate(float(distance) / unit, float(fork), int(count), int(finest), smooth is not None)
     return gate, float(least or 0)
+
+
+def config_of_file(found: GaussianSource) -> Config:
+    """Return a configuration with what the header of a file states: antialiasing and background."""
+    background = triple_of(found.comments, "background")
+    if background is not None and not all(0 <= value <= 1 for value in background):
+        background = None
+    return Config(model=ModelConfig(antialiased=is_antialiased(found), background=background))
 
 
 def subject_of_file(found: Gaussians, config: Config, space: Space, ranks: Ranks) -> Subject:

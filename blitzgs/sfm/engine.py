@@ -65,6 +65,11 @@ def read_positions(database: Path) -> dict[str, Float64]:
     return {name: position for name, position in positions.items() if np.isfinite(position[:2]).all()}
 
 
+def lack_places(database: str, names: Sequence[str]) -> bool:
+    """Tell whether some photographs have no place by GPS: they have no neighbours by it."""
+    return not set(names) <= read_positions(Path(database)).keys()
+
+
 def camera_of(database: Path, names: Sequence[str]) -> int | None:
     """Return the camera that an interrupted stage gave to one of the photographs, or None."""
     known = dict(_rows(database, "SELECT name, camera_id FROM images")) if database.exists() else {}
@@ -78,6 +83,8 @@ _POSES = re.compile(r"num_reg_frames=(\d+)")
 _MATCHERS = {"gps": "spatial", "sequence": "sequential", "exhaustive": "exhaustive"}
 # Photographs up to which every pair is matched, and poses are found one after the other.
 MOST_IN_ALL_PAIRS, _MOST_ONE_BY_ONE = 300, 500
+# Photographs without a place, among others with one, are compared with so many that follow by name.
+LIKE_NAMES = 10
 # Photographs of a camera that determine a full lens.
 MANY = 15
 # Bytes; with fewer, a failure may be that of the disk.
@@ -216,6 +223,10 @@ def _commands(program: str, stage: str, job: Job) -> Iterator[list[str]]:
         matcher = _MATCHERS[job.pairs]
         far = ["--SpatialMatching.max_distance", "1e9"] if job.pairs == "gps" else []
         yield [program, f"{matcher}_matcher", *base, *far, *_gpu_flags(program, f"{matcher}_matcher")]
+        if job.pairs == "gps" and lack_places(job.database, job.names):
+            overlap = ["--SequentialMatching.overlap", str(LIKE_NAMES)]
+            gpu = _gpu_flags(program, "sequential_matcher")
+            yield [program, "sequential_matcher", *base, *overlap, *gpu]
     else:
         mapper = (
             "global_mapper"

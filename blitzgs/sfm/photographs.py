@@ -24,6 +24,8 @@ from blitzgs.util.output import write_file
 
 # Files and folders of what programs write beside photographs.
 _BY_PRODUCT = re.compile(rf"(?i)(^|/)({BY_PRODUCTS})s?(_?\d+)?[./]|_mask\.|\.mask\.")
+# What COLMAP reads.
+_READ = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 # A place by GPS is right to some metres: photographs within fewer metres say nothing of each other.
 _LEAST_SPREAD = 30.0
 _METRES_PER_DEGREE = 111_000.0
@@ -84,6 +86,10 @@ class Photographs:
         root = folder if (folder / "masks").is_dir() else folder.parent
         masks = find_masks(root, None, names, [None] * len(names))
         problems = damaged([(folder / name, mask) for name, mask in zip(names, masks, strict=True)])
+        for i, name in enumerate(names):
+            if not name.lower().endswith(_READ):
+                suffix = PurePosixPath(name).suffix
+                problems.setdefault(i, f"COLMAP reads no {suffix} files: convert it to JPEG or PNG")
         sound = [i for i in range(len(names)) if i not in problems]
         if len(sound) < 3:
             why = f"; {next(iter(problems.values()))}" if problems else ""

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from blitzgs.sfm.engine import MANY, adopt, camera_of, least_model, lens_model
+from blitzgs.sfm.engine import LIKE_NAMES, MANY, adopt, camera_of, lack_places, least_model, lens_model
 
 # The standard deviations of a position by GPS in metres, across and up; the second of an altitude that says
 # nothing. Drones state altitudes by barometer, which drift between flights.
@@ -65,6 +65,11 @@ def features(job: dict[str, Any]) -> None:
         for image in database.read_all_images():
             _, latitude, longitude = seen.get(image.name, ("", None, None))
             prior = known.get(image.image_id)
+            if (latitude, longitude) == (0, 0):  # a receiver without a fix
+                if prior is not None:
+                    prior.position = np.full(3, np.nan)
+                    database.update_pose_prior(prior)
+                continue
             if latitude is None or longitude is None or (prior is not None and prior.has_position()):
                 continue
             added = prior or pycolmap.PosePrior(corr_data_id=image.data_id)
@@ -82,6 +87,9 @@ def pairs(job: dict[str, Any]) -> None:
         # The number of neighbours limits the pairs: the flying height decides on a good distance.
         spatial = pycolmap.SpatialPairingOptions(ignore_z=True, max_distance=1e9)
         pycolmap.match_spatial(job["database"], pairing_options=spatial)
+        if lack_places(job["database"], job["names"]):
+            by_name = pycolmap.SequentialPairingOptions(overlap=LIKE_NAMES, quadratic_overlap=False)
+            pycolmap.match_sequential(job["database"], pairing_options=by_name)
     elif job["pairs"] == "sequence":
         sequence = pycolmap.SequentialPairingOptions(overlap=20, quadratic_overlap=True)
         pycolmap.match_sequential(job["database"], pairing_options=sequence)
@@ -95,12 +103,17 @@ def pairs(job: dict[str, Any]) -> None:
 def _set_priors(database: Any, georeference: Path, use_altitude: bool) -> None:
     """Replace positions by GPS by metres east, north and up of the first one, with their uncertainty."""
     names = {image.image_id: image.name for image in database.read_all_images()}
-    priors = [prior for prior in database.read_all_pose_priors() if prior.has_position()]
-    priors.sort(key=lambda prior: names[prior.corr_data_id.id])
     # After an interruption only some are left to be replaced, and the origin is chosen.
-    priors = [prior for prior in priors if prior.coordinate_system.name == "WGS84"]
-    if not priors:
-        return
+    left = [prior for prior in database.read_all_pose_priors() if prior.coordinate_system.name == "WGS84"]
+    left.sort(key=lambda prior: names[prior.corr_data_id.id])
+    if priors := [prior for prior in left if prior.has_position()]:
+        _move_to_metres(priors, georeference, use_altitude)
+    for prior in left:
+        prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
+        database.update_pose_prior(prior)
+
+
+def _move_to_metres(priors: list[Any], georeference: Path, use_altitude: bool) -> None:
     degrees = np.stack([prior.position for prior in priors])
     if not use_altitude:
         degrees[:, 2] = 0.0
@@ -114,8 +127,6 @@ def _set_priors(database: Any, georeference: Path, use_altitude: bool) -> None:
     variance = np.diag([_ACROSS**2, _ACROSS**2, (_UP if use_altitude else _UNKNOWN) ** 2])
     for prior, position in zip(priors, metres, strict=True):
         prior.position, prior.position_covariance = position, variance
-        prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
-        database.update_pose_prior(prior)
 
 
 def cameras(job: dict[str, Any]) -> None:

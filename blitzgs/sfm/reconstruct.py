@@ -77,6 +77,7 @@ def reconstruct(photographs: Photographs, capture: Path, settings: Settings) -> 
         )
     links = _links(photographs, capture)
     work.mkdir(parents=True, exist_ok=True)
+    make_links(links)
     with at_work(work) as lock:
         state = _state(work, photographs, settings)
         masks = photographs.write_masks(work / "masks")
@@ -107,7 +108,7 @@ def reconstruct(photographs: Photographs, capture: Path, settings: Settings) -> 
         models = sorted(Path(job.models).glob("[0-9]*"), key=count_images, reverse=True)
         if not models or not count_images(models[0]):
             raise StageError(_no_poses(photographs, work))
-        _write_capture(models[0], links, capture)
+        _write_model(models[0], capture)
         _write_frame(Path(job.georeference), capture / GEO)
         return examine(capture, work, photographs, job, models)
 
@@ -163,12 +164,21 @@ def _links(photographs: Photographs, capture: Path) -> dict[Path, Path]:
     return links
 
 
-def _write_capture(model: Path, links: dict[Path, Path], capture: Path) -> None:
-    """Write the model and the links."""
+def make_links(links: dict[Path, Path]) -> None:
+    """Make links, before the work of hours: some disks (exFAT) cannot hold any (OSError)."""
     for link, target in links.items():
-        if not link.exists():
-            link.unlink(missing_ok=True)
-            link.symlink_to(target.resolve(), target_is_directory=True)
+        if link.exists():
+            continue
+        link.unlink(missing_ok=True)
+        try:
+            link.symlink_to(target.resolve())
+        except OSError as error:
+            raise OSError(
+                f"{link} cannot be a link to {target} ({error.strerror}): choose a capture on a disk of Linux"
+            ) from error
+
+
+def _write_model(model: Path, capture: Path) -> None:
     sparse = capture / "sparse" / "0"
     sparse.mkdir(parents=True, exist_ok=True)
     for name in FILES:

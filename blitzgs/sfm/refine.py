@@ -23,7 +23,7 @@ from blitzgs.capture.colmap import (
 )
 from blitzgs.capture.names import IMAGE_SUFFIXES
 from blitzgs.sfm.engine import has_pycolmap, run_pycolmap
-from blitzgs.sfm.reconstruct import WORK, at_work
+from blitzgs.sfm.reconstruct import WORK, at_work, make_links
 from blitzgs.sfm.report import distances, misses
 from blitzgs.util.errors import warn
 from blitzgs.util.output import check_outside
@@ -105,6 +105,7 @@ def refine(root: Path, capture: Path) -> Refined:
         )
     work = capture / WORK
     work.mkdir(parents=True, exist_ok=True)
+    make_links({capture / path.name: path for path in others})
     with at_work(work) as lock, image_progress("poses", unit="rounds") as report:
         (found := work / "models").mkdir(exist_ok=True)
         job = {"model": str(folder.absolute()), "refined": str(found), "miss": float(np.nanmedian(every))}
@@ -116,9 +117,6 @@ def refine(root: Path, capture: Path) -> Refined:
     for file in (complete_files(source) or {}).values():
         shutil.copyfile(file, sparse / "0" / file.name)
     shutil.rmtree(found)
-    for path in others:
-        if not (link := capture / path.name).is_symlink():
-            link.symlink_to(path.resolve(), target_is_directory=path.is_dir())
     (work / "refined.json").write_text(json.dumps(asdict(refined), indent=1))
     sparse.rename(capture / "sparse")
     return refined

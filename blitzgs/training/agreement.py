@@ -27,18 +27,21 @@ from blitzgs.runs.checkpoint import Saving
 MAX_STEPS = 16
 MAX_SECONDS = 4.0
 
+# torchrun sends a terminal's SIGINT once more, which is no second one.
+REPEAT_SECONDS = 1.0
 _SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
 class StopRequest:
     """Turns SIGTERM, SIGINT and SIGHUP into a request that the loop handles between two steps.
 
-    A second SIGINT raises KeyboardInterrupt at once. If SIGHUP was ignored before (`nohup`), it stays
-    ignored.
+    A second SIGINT, `REPEAT_SECONDS` later, raises KeyboardInterrupt at once. If SIGHUP was ignored before
+    (`nohup`), it stays ignored.
     """
 
     def __init__(self) -> None:
         self.number = 0
+        self._again = 0.0  # from when on a SIGINT is a second one
         self._previous: dict[int, object] = {}
 
     def __enter__(self) -> StopRequest:
@@ -54,9 +57,11 @@ class StopRequest:
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         # A closing terminal sends SIGHUP and SIGTERM together, so only a second SIGINT means "at once".
-        if number == signal.SIGINT and self.number == signal.SIGINT:
+        if number == signal.SIGINT == self.number:
+            if time.monotonic() < self._again:
+                return
             raise KeyboardInterrupt
-        self.number = number
+        self.number, self._again = number, time.monotonic() + REPEAT_SECONDS
 
 
 class SaveClock:

@@ -129,9 +129,10 @@ def measure_step(state: TrainingState, frame: Frame, batch: Batch) -> HostCopy:
         scale = scale_term(frame, table, extent * SCALE_UNIT).mean()
     if loss.opacity > 0:
         opacity = opacity_term(frame, table).mean()
-    shown = None
+    # Over random colours, the PSNR of a view with a border that no Gaussian covers would be random.
+    shown = frame.over_own_background()
     if (exposures := state.stepper.exposures) is not None:  # as the loss compares them
-        shown, _ = exposures.shown(frame.renders, batch.indices)
+        shown, _ = exposures.shown(shown, batch.indices)
     terms = torch.stack([scale, opacity, batch_psnr(frame, batch, shown)])
     figures = torch.cat([counts.double(), terms.double(), batch.samples.double()])
     return HostCopy(figures.view(torch.int64))

@@ -20,6 +20,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import is_antialiased
 from blitzgs.formats.models import read_gaussians, with_degree
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.ops.population import limit_scales_
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.population.initialisation import INITIAL_OPACITY, octree_gaussians
 from blitzgs.population.relocation import PositionNoise
@@ -208,7 +209,7 @@ def _continued(config: Config, restored: TrainedModel | None, extend: float | No
     if extend is not None:
         # An interrupted extension may have left its schedule in the folder's configuration.
         config = replace(config, schedule=restored.config.schedule)
-    check_resumable(restored.config, config)
+    check_resumable(restored.config, config, restored.progress.step)
     return config if extend is None else extended(config, restored.progress.step, extend)
 
 
@@ -255,13 +256,17 @@ def _stepper(
     noise, factor = None, config.optimiser.position_noise
     if factor > 0:
         noise = PositionNoise(factor, extent, config.population.min_opacity, config.seed)
-    limit = config.population.prune_world_scale if config.model.random_background else 0.0
-    shared = (optimiser, owners, config.loss, extent, noise, limit)
+    shared = (optimiser, owners, config.loss, extent, noise, _axis_limit(config))
     if not isinstance(table, HostTable):
         return Stepper(table, *shared)
     budget = int(config.memory.resident_gb * 1e9)
     pool = Pool(table, owners.ranks.device, budget, optimiser.pending_table)
     return OffloadingStepper(pool, upcoming, *shared)
+
+
+def _axis_limit(config: Config) -> float:
+    """Return to which share of the extent a run's steps limit the axes of Gaussians; 0: they do not."""
+    return config.population.prune_world_scale if config.model.random_background else 0.0
 
 
 def _start_lineage(
@@ -351,4 +356,14 @@ def _of_file(
     ):
         found = replace(found, levels=None)
     columns = trained_columns(with_degree(found, degree), space, ranks)
+    if (share := _axis_limit(config)) > 0:
+        limited, rows = columns["scales"].clone(), torch.arange(len(columns["id"]), dtype=torch.int32)
+        limit_scales_(limited, columns["means"], rows, share=share, extent=space.extent)
+        larger = sum(ranks.all_gather_object(int((limited < columns["scales"]).any(1).sum())))
+        if larger and ranks.rank == 0:
+            warn(
+                f"{larger:,} of the {count:,} Gaussians of {path} have axes longer than this run's limit and "
+                "are made smaller, which may open holes that training has to close: "
+                "--population.prune_world_scale=0 keeps them"
+            )
     return GaussianTable.create({name: column.to(home) for name, column in columns.items()}), count, known

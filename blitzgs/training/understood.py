@@ -9,9 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from blitzgs.capture.cameras import Camera, Float64
 from blitzgs.capture.capture import Capture
+from blitzgs.capture.image_files import UInt8
 from blitzgs.capture.images import ImageStore
-from blitzgs.capture.lengths import NEAR_OF_EXTENT, depths_seen, sampled
+from blitzgs.capture.lengths import NEAR_OF_EXTENT, depths_seen, points_seen, sampled
 from blitzgs.config.fields import BLACK, Config
 from blitzgs.config.schedule import Schedule, stretched
 from blitzgs.population.density import growth_limit
@@ -23,6 +25,10 @@ from blitzgs.util.errors import printable, warn
 _DECODED, _PROJECTED = 16, 100
 # Means of a photograph or of all points' colours, of 255, from which it is black or saturated.
 _BLACK, _SATURATED = 4.0, 251.0
+# The brightness of points and of the pixels that show them correlates by 0.5 to 0.95, with another photograph
+# or a turned or cropped one by -0.2 to 0.2; among points that are mostly hidden, both are less. The least
+# number of points, the least correlation, and its least share of that of the other photographs.
+_LEAST_POINTS, _ALIKE, _AS_OTHERS = 100, 0.12, 0.3
 
 
 class HopelessCaptureError(ValueError):
@@ -36,6 +42,7 @@ class Pictures:
     means: list[float]  # mean of each, over the pixels that count, 0 to 255
     masked: list[float]  # share of each that its mask excludes, of those with a mask
     unread: list[str]  # what is wrong with those that could not be decoded
+    likeness: dict[str, float]  # correlation with the points' brightness, by name; NaN: unknown
 
 
 def check_worlds(capture: Capture) -> None:
@@ -81,7 +88,8 @@ def _look(capture: Capture, images: ImageStore) -> Pictures:
     """Decode some photographs, evenly chosen; a damaged one is left to the reader that needs it."""
     some = capture.train[:: -(-len(capture.train) // _DECODED)]
     images.prefetch(some)
-    pictures = Pictures([], [], [])
+    pictures = Pictures([], [], [], {})
+    points, colors = (sampled(column, len(capture.cameras)) for column in (capture.points, capture.colors))
     for index in some:
         try:
             image, mask = images.get(index).numpy(), images.mask(index)
@@ -90,6 +98,8 @@ def _look(capture: Capture, images: ImageStore) -> Pictures:
             if str(error) not in pictures.unread:
                 pictures.unread.append(str(error))
             continue
+        camera = capture.cameras[index]
+        pictures.likeness[camera.name] = _likeness(camera, image, points, colors)
         step = max(1, min(image.shape[:2]) // 256)
         pixels = image[::step, ::step]
         if mask is None:
@@ -100,6 +110,16 @@ def _look(capture: Capture, images: ImageStore) -> Pictures:
         if counts.any():
             pictures.means.append(float(pixels[counts].mean()))
     return pictures
+
+
+def _likeness(camera: Camera, image: UInt8, points: Float64, colors: UInt8) -> float:
+    """Return the correlation of the brightness of points and of their pixels; NaN: there are too few."""
+    seen, (x, y, _) = points_seen(camera, points)
+    if len(seen) < _LEAST_POINTS:
+        return math.nan
+    shown, expected = image[y.astype(int), x.astype(int)].mean(axis=1), colors[seen].mean(axis=1)
+    spread = shown.std() * expected.std()
+    return float(np.cov(shown, expected, ddof=0)[0, 1] / spread) if spread else math.nan
 
 
 def _warn_of_pictures(capture: Capture, pictures: Pictures, near: float) -> None:
@@ -122,6 +142,15 @@ def _warn_of_pictures(capture: Capture, pictures: Pictures, near: float) -> None
                 f"the points' colours are {what} (mean {mean:.0f} of 255), and the photographs are not: "
                 "the model starts with a wrong picture; are the colours read from the right fields?"
             )
+    known = {name: likeness for name, likeness in pictures.likeness.items() if not math.isnan(likeness)}
+    least = max(_ALIKE, _AS_OTHERS * float(np.median(list(known.values())))) if known else 0.0
+    unlike = [name for name, likeness in known.items() if likeness < least]
+    if unlike and not capture.about.random_points:
+        warn(
+            f"{len(unlike)} of {len(known)} photographs that were looked at show other colours than the "
+            f"points where these should be (first: {unlike[0]}): are they the photographs of these poses, "
+            "not turned, cropped or renamed since, and the points those of the scene?"
+        )
     views = capture.train[:_PROJECTED]
     points = sampled(capture.points, len(capture.cameras))
     depths = [depths_seen(capture.cameras[i], points) for i in views]

@@ -89,14 +89,14 @@ def optional_package(name: str, extra: str, what: str) -> Any:
         ) from error
 
 
-def check_tensor(name: str, value: object) -> None:
-    """Raise a TypeError unless a value is a tensor."""
+def check_tensors(**values: object) -> None:
+    """Raise a TypeError unless all values are tensors; it names the first that is none."""
     import torch
 
-    if isinstance(value, torch.Tensor):
-        return
-    hint = ": convert it with torch.from_numpy" if type(value).__module__ == "numpy" else ""
-    raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}{hint}")
+    for name, value in values.items():
+        if not isinstance(value, torch.Tensor):
+            hint = ": convert it with torch.from_numpy" if type(value).__module__ == "numpy" else ""
+            raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}{hint}")
 
 
 def check_number(name: str, value: object) -> None:

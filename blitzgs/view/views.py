@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -17,6 +18,9 @@ from blitzgs.config.fields import BLACK, Config
 from blitzgs.frame.render import RenderOptions
 from blitzgs.ops.projection_types import Views
 from blitzgs.view.gate import LodGate, centres_of
+
+# The z axis is up if it is nearer to the cameras' up than this; many captures are georeferenced.
+_NEAR_Z = math.cos(math.radians(40))
 
 
 class CameraLike(Protocol):
@@ -156,3 +160,24 @@ def render_options(config: Config, space: Space, sh_degree: int, lod: LodGate | 
 def trained_centres(cameras: list[CameraLike], space: Space) -> Tensor:
     """Return the positions of cameras in the trained world, float64 [V, 3]."""
     return torch.from_numpy(camera_centres(np.stack([viewmat(camera, space) for camera in cameras])))
+
+
+def up_direction(poses: Sequence[npt.NDArray[np.float64]]) -> npt.NDArray[np.float64]:
+    """Guess which direction is up from the cameras' poses, each world to camera [4, 4].
+
+    Cameras that look around stand upright, so the mean of their up vectors is up. Cameras that look down from
+    above turn about their view, so its mean is down, even where most fly in one direction. Taken is the mean
+    in which they agree more, or the z axis if it is near either, or if nothing is known.
+    """
+    z = np.array([0.0, 0.0, 1.0])
+    if not poses:
+        return z
+    upright = -np.mean([pose[1, :3] for pose in poses], axis=0)
+    backward = -np.mean([pose[2, :3] for pose in poses], axis=0)
+    for guess in (upright, backward):
+        length = float(np.linalg.norm(guess))
+        if length > 0.3 and guess @ z / length > _NEAR_Z:
+            return z
+    best = max(upright, backward, key=np.linalg.norm)
+    length = float(np.linalg.norm(best))
+    return best / length if length > 1e-3 else z

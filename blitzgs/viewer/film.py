@@ -94,13 +94,20 @@ class Film(CameraPath):
     # One of `TOURS`, which gives the keyframes once the model is open; empty: they are known.
     kind: str = ""
 
-    def cameras(self, space: Space, cameras: Sequence[CameraLike], box: Array) -> list[RunCamera]:
+    def cameras(
+        self,
+        space: Space,
+        cameras: Sequence[CameraLike],
+        box: Array,
+        up: tuple[float, float, float] | None = None,
+    ) -> list[RunCamera]:
         """Return the cameras of all frames, in the re-centred world.
 
         `cameras`: of its capture; may be empty. `box`: corners of a box that holds nearly all Gaussians,
-        [2, 3], trained units. ValueError: the path cannot be made without cameras.
+        [2, 3], trained units. `up`: the upward direction; None: the cameras tell. ValueError: the path cannot
+        be made without cameras.
         """
-        keys = tour(self.kind, World(space, cameras, box)) if self.kind else self.keyframes
+        keys = tour(self.kind, World(space, cameras, box, up)) if self.kind else self.keyframes
         found = []
         for number, frame in enumerate(replace(self, keyframes=keys).frames(), 1):
             pose = np.linalg.inv(frame.camera_to_world)

@@ -70,7 +70,7 @@ class Page:
         self._turn = 0
         self._sender = ThreadPoolExecutor(1, "viewer sender")
         self._sending = threading.Semaphore(2)
-        self.world = World(exhibit.space, exhibit.cameras, exhibit.box)
+        self.world = World(exhibit.space, exhibit.cameras, exhibit.box, exhibit.up)
         # Its address behind the door is nobody's concern.
         with contextlib.redirect_stdout(io.StringIO()):
             self._server = viser.ViserServer(host="127.0.0.1", port=0, label=exhibit.title, verbose=False)

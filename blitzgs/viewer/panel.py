@@ -198,8 +198,11 @@ _BOX = (
     "font:12px/1.5 ui-monospace,monospace;text-shadow:0 0 3px #000,0 0 3px #000;"
     "background:rgba(0,0,0,.45);border-radius:6px;padding:8px 12px"
 )
-# On a narrow page, the panel is at the bottom.
-_NARROW = "@media(max-width:600px){#blitzgs-figures{inset:14px 14px auto!important;font-size:11px!important}}"
+# On a narrow page, viser's panel is at the bottom and covers the lower 60 % of the model; a tap folds it.
+_NARROW = (
+    "@media(max-width:600px){#blitzgs-figures{inset:14px 14px auto!important;font-size:11px!important}"
+    "[style*='max-height: 60%']{max-height:36%!important}}"
+)
 _TURBO = "linear-gradient(90deg,#7a0403,#d23105,#fb8022,#e1dd37,#61fc6c,#1ae4b6,#4490fe,#30123b)"
 _INFERNO = "linear-gradient(90deg,#000004,#420a68,#932667,#dd513a,#fca50a,#fcffa4)"
 _GREY = "linear-gradient(90deg,#000,#fff)"

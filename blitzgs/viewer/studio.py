@@ -13,9 +13,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from blitzgs.config.fields import Config, ModelConfig
+from blitzgs.config.files import changed
 from blitzgs.distributed.group import Ranks
-from blitzgs.formats.gaussians import Gaussians, is_antialiased, joined
+from blitzgs.formats.gaussians import Gaussians, joined, up_of
 from blitzgs.formats.models import offset_of, open_gaussians
 from blitzgs.formats.selection import Selected, Selection
 from blitzgs.frame.ownership import TileOwners
@@ -23,7 +23,7 @@ from blitzgs.runs import run_files
 from blitzgs.runs.cameras import stored_cameras
 from blitzgs.runs.folder import open_run, subject_of
 from blitzgs.runs.source import largest_of_run, open_source
-from blitzgs.runs.world import load_world_frame, subject_of_file
+from blitzgs.runs.world import config_of_file, load_world_frame, subject_of_file
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.view.draw import Drawer
 from blitzgs.view.views import Space
@@ -123,7 +123,7 @@ def _open_file(path: Path, ranks: Ranks, paths: Path, most: int | None) -> Opene
     middle, extent = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
     # Centred, so that float32 resolves the positions of a georeferenced model as finely as the file does.
     space = Space.of(middle + np.array(offset_of(found.comments)), max(extent, 1e-6))
-    config = Config(model=ModelConfig(antialiased=is_antialiased(found), near=1e-3))
+    config = changed(config_of_file(found), "model", near=1e-3)
     subject = subject_of_file(found, config, space, ranks)
     lod = subject.lod
     exhibit = Exhibit(
@@ -135,6 +135,7 @@ def _open_file(path: Path, ranks: Ranks, paths: Path, most: int | None) -> Opene
         lod=lod is not None,
         smooth=lod is not None and lod.gate.smooth,
         box=(box - middle) / space.unit,
+        up=up_of(found.comments),
         paths=paths,
     )
     return Opened(exhibit, subject, ranks, count - len(found))

@@ -13,9 +13,9 @@ import numpy.typing as npt
 from torch import Tensor
 
 from blitzgs.capture.world import GEOCENTRIC, WorldFrame, converted, reference_system
-from blitzgs.config.fields import Config, ModelConfig
+from blitzgs.config.files import changed
 from blitzgs.distributed.group import Ranks
-from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased
+from blitzgs.formats.gaussians import Gaussians, GaussianSource, up_of
 from blitzgs.formats.models import offset_of, open_gaussians, with_degree
 from blitzgs.formats.selection import opacity_length
 from blitzgs.formats.tiles import upright
@@ -25,7 +25,7 @@ from blitzgs.runs import run_files
 from blitzgs.runs.cameras import stored_cameras
 from blitzgs.runs.clean import contributions as measured
 from blitzgs.runs.source import open_source
-from blitzgs.runs.world import load_world_frame
+from blitzgs.runs.world import config_of_file, load_world_frame
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.util.errors import located
@@ -70,7 +70,7 @@ def web_file(opened: Opened, max_bytes: int) -> WebFile:
     while degree > 0 and estimated_bytes(splats) > space:
         degree -= 1
         splats = with_degree(splats, degree)
-    world = World(exhibit.space, exhibit.cameras, exhibit.box)
+    world = World(exhibit.space, exhibit.cameras, exhibit.box, exhibit.up)
     scene = web_scene(world, options, 1.0, None if lod is None else _levels(lod))
     kept = min(visible, int(0.99 * visible * space / estimated_bytes(splats)))
     if kept < visible:
@@ -203,10 +203,10 @@ def open_city(path: Path, checked: bool = True) -> City:
     if run is None:
         extent = float(np.linalg.norm(box[1] - box[0])) / 2
         space = Space.of(offset, extent)
-        config = Config(model=ModelConfig(antialiased=is_antialiased(source), near=1e-3))
+        config = changed(config_of_file(source), "model", near=1e-3)
     else:
         space, config = run.space, run.config
-    world = World(space, cameras, box / space.unit)
+    world = World(space, cameras, box / space.unit, up_of(source.comments))
     scene = web_scene(world, render_options(config, space, source.degree), space.unit)
     return City(source, offset, space.extent * space.unit, frame, scene, path.resolve().stem)
 

@@ -13,13 +13,11 @@ import numpy.typing as npt
 
 from blitzgs.capture.cameras import camera_centres
 from blitzgs.capture.world import WorldFrame
-from blitzgs.view.views import CameraLike, Space, viewmat
+from blitzgs.view.views import CameraLike, Space, up_direction, viewmat
 
 Array = npt.NDArray[np.float64]
 # Page units per trained unit. The scene is then 5 to 10 page units wide; the keys move 2 a second.
 SCALE = 5.0
-# The z axis is up if it is nearer to the cameras' up than this; many captures are georeferenced.
-_NEAR_Z = math.cos(math.radians(40))
 
 
 @dataclass(frozen=True)
@@ -40,17 +38,23 @@ class Stance:
 class World:
     """Maps between the page's coordinates, the trained ones and those of the capture."""
 
-    def __init__(self, space: Space, cameras: Sequence[CameraLike], box: Array) -> None:
+    def __init__(
+        self,
+        space: Space,
+        cameras: Sequence[CameraLike],
+        box: Array,
+        up: tuple[float, float, float] | None = None,
+    ) -> None:
         """Find up and the middle of a scene.
 
         `space`: the trained world. `cameras`: the capture's; may be empty. `box`: corners of a box that holds
-        nearly all Gaussians, [2, 3], trained units.
+        nearly all Gaussians, [2, 3], trained units. `up`: the upward direction; None: the cameras tell.
         """
         self.space = space
         self.poses = [viewmat(camera, space) for camera in cameras]
         self.fovs = [2 * math.atan(camera.height / (2 * camera.K[1, 1])) for camera in cameras]
         self.centres = SCALE * camera_centres(np.stack(self.poses)) if self.poses else np.zeros((0, 3))
-        self.up = up_direction(self.poses)
+        self.up = up_direction(self.poses) if up is None else np.array(up) / np.linalg.norm(up)
         self.middle = SCALE * box.mean(axis=0)
 
     def viewmat(self, stance: Stance) -> Array:
@@ -113,27 +117,6 @@ def looking(position: Array, target: Array, up: Array, fov: float) -> Stance:
     return Stance(position.astype(np.float64), rotation, fov)
 
 
-def up_direction(poses: Sequence[Array]) -> Array:
-    """Guess which direction is up from the cameras' poses, each world to camera [4, 4].
-
-    Cameras that look around stand upright, so the mean of their up vectors is up. Cameras that look down from
-    above turn about their view, so its mean is down, even where most fly in one direction. Taken is the mean
-    in which they agree more, or the z axis if it is near either, or if nothing is known.
-    """
-    z = np.array([0.0, 0.0, 1.0])
-    if not poses:
-        return z
-    upright = -np.mean([pose[1, :3] for pose in poses], axis=0)
-    backward = -np.mean([pose[2, :3] for pose in poses], axis=0)
-    for guess in (upright, backward):
-        length = float(np.linalg.norm(guess))
-        if length > 0.3 and guess @ z / length > _NEAR_Z:
-            return z
-    best = max(upright, backward, key=np.linalg.norm)
-    length = float(np.linalg.norm(best))
-    return best / length if length > 1e-3 else z
-
-
 @dataclass(frozen=True)
 class Exhibit:
     """A model or a training to show."""
@@ -148,6 +131,7 @@ class Exhibit:
     # Corners of a box that holds nearly all Gaussians, float64 [2, 3], trained units.
     box: npt.NDArray[np.float64]
     cameras: Sequence[CameraLike] = ()  # the capture's cameras
+    up: tuple[float, float, float] | None = None  # upward direction; None: the cameras tell
     test: Sequence[int] = ()  # indices of those that are held out
     # Returns the photograph of a camera, uint8 [H, W, 3]; None: there are none.
     photograph: Callable[[int], npt.NDArray[np.uint8]] | None = None

@@ -259,6 +259,23 @@ def test_one_graph_takes_other_numbers_of_gaussians_views_and_pixels(packed):
     assert graphs == {2}
 
 
+_views = 1  # for a graph, a global that changed is a number that varies
+
+
+def test_a_graph_takes_colours_that_were_expanded_to_other_numbers_of_views(monkeypatch):
+    torch._dynamo.reset()
+    for views in (1, 3):
+        scene = random_scene(n=20, cameras=views)
+        monkeypatch.setitem(globals(), "_views", views)
+
+        def image(means, scene=scene):
+            colors = scene.colors.expand(_views, -1, -1, -1)
+            return rasterize_scene(replace(scene, means=means, colors=colors))[0]
+
+        compiled = torch.compile(image, fullgraph=True, backend="eager")
+        assert torch.equal(compiled(scene.means), image(scene.means))
+
+
 def test_a_graph_of_many_views_and_one_of_covariances():
     torch._dynamo.reset()
     views = random_scene(n=20, cameras=34, width=8, height=8).leaves()

@@ -242,6 +242,32 @@ def test_masks_and_coefficients_of_other_rows_are_refused():
         refused(ValueError, message.format(rows, shown), blitzgs.spherical_harmonics, *arguments)
 
 
+@pytest.mark.parametrize(
+    ("function", "names"),
+    [
+        (
+            lambda dirs, coeffs, masks: blitzgs.spherical_harmonics(0, dirs, coeffs, masks),
+            "dirs coeffs masks",
+        ),
+        (blitzgs.quat_scale_to_covar_preci, "quats scales"),
+        (blitzgs.relocate, "opacities scales ratios"),
+    ],
+    ids=["spherical_harmonics", "quat_scale_to_covar_preci", "relocate"],
+)
+def test_what_is_no_tensor_is_named(function, names):
+    for name in names.split():
+        given = {other: torch.ones(1, 3) for other in names.split()}
+        if "masks" in given:
+            given |= {"coeffs": torch.ones(1, 1, 3), "masks": torch.ones(1, dtype=torch.bool)}
+        refused(TypeError, f"{name} must be a torch.Tensor, got list", function, **{**given, name: [1.0]})
+
+
+def test_masks_of_another_dtype_are_named():
+    message = "masks must be bool, got torch.int64; pass masks != 0"
+    arguments = 1, torch.zeros(4, 3), torch.zeros(4, 4, 3), torch.ones(4, dtype=torch.int64)
+    refused(TypeError, message, blitzgs.spherical_harmonics, *arguments)
+
+
 def with_channels(scene, channels):
     """The scene with other SH channels; the last ones are those that it had."""
     extra = torch.randn(*scene.colors.shape[:-1], channels - 3, dtype=scene.colors.dtype)

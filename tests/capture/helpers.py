@@ -49,9 +49,17 @@ def write_image(path: Path, pixels: np.ndarray, *flags: int) -> None:
 
 
 def reconstruction(
-    names: list[str], width: int, height: int, model: str = "PINHOLE", params: list[float] | None = None
+    names: list[str],
+    width: int,
+    height: int,
+    model: str = "PINHOLE",
+    params: list[float] | None = None,
+    around: int = 0,
 ) -> pycolmap.Reconstruction:
-    """Cameras on a circle of radius 4 that look at 20 points with tracks around the origin."""
+    """Cameras on a circle of radius 4 that look at 20 points with tracks around the origin.
+
+    `around`: the number of cameras that the circle has room for; 0: as many as there are.
+    """
     rec = pycolmap.Reconstruction()
     camera = pycolmap.Camera.create_from_model_name(1, model, 0.8 * width, width, height)
     if params is not None:
@@ -60,7 +68,7 @@ def reconstruction(
     random = np.random.default_rng(0)
     points = random.uniform(-1, 1, (20, 3))
     for index, name in enumerate(names, start=1):
-        angle = 2 * np.pi * index / max(len(names), 1)
+        angle = 2 * np.pi * index / (around or max(len(names), 1))
         center = np.array([4 * np.cos(angle), 4 * np.sin(angle), 0.5])
         pose = pycolmap.Rigid3d(look_at_origin(center)[:3])
         image = pycolmap.Image(name=name, camera_id=1, image_id=index)

@@ -143,6 +143,16 @@ def test_two_cameras_of_one_id_or_images_of_one_name_are_refused(tmp_path):
         load_capture(tmp_path)
 
 
+def test_cameras_without_photographs_may_be_of_any_kind(tmp_path):
+    write_capture(tmp_path, NAMES[:3])
+    panorama = colmap.ColmapCamera(7, "EQUIRECTANGULAR", 64, 32, np.array([64.0, 32.0]))
+    unknown = colmap.ColmapCamera(4294967295, "PINHOLE", 64, 48, np.zeros(4))
+    edit_model(tmp_path, lambda model: model.cameras.extend([panorama, unknown]))
+    assert len(load_capture(tmp_path).cameras) == 3
+    edit_model(tmp_path, lambda model: model.images.camera_ids.put(0, 7))
+    refused(ValueError, "sparse/0: camera 7: EQUIRECTANGULAR images show all", load_capture, tmp_path)
+
+
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_exif_orientation_turns_an_image_only_when_its_camera_is_upright(tmp_path, orientation):
     upright = smooth_image(80, 48)

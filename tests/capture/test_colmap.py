@@ -264,8 +264,9 @@ def test_transforms_that_were_written_on_windows(tmp_path):
 
 
 def test_files_are_found_once_and_none_that_is_hidden(tmp_path):
-    for file in ("a.jpg", "._a.jpg", "day/b.jpg", ".cache/c.jpg"):
-        (tmp_path / file).parent.mkdir(exist_ok=True)
+    others = ("@eaDir/a.jpg/SYNOFILE_THUMB_M.jpg", "day/@eaDir/b.jpg", "$RECYCLE.BIN/d.jpg", "#recycle/e.jpg")
+    for file in ("a.jpg", "._a.jpg", "day/b.jpg", ".cache/c.jpg", *others):
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file).touch()
     (tmp_path / "day/up").symlink_to(tmp_path)
     (tmp_path / "night").symlink_to("day")

@@ -387,3 +387,18 @@ def test_unused_bands_are_said_at_load_and_alpha_is_counted(tmp_path):
     store = ImageStore(capture, background=(0.0, 0.0, 0.0))
     shown = [store.get(i)[5, 5].tolist() for i in range(3)]
     assert shown == [[200, 100, 50], [100, 50, 25], [200, 100, 50]]
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
+def test_grey_photographs_among_colours_are_named(tmp_path, suffix, recwarn):
+    names = ["a_D.jpg", f"b_MS_G{suffix}", "c_D.jpg"]
+    root = write_capture(tmp_path, names)
+    load_capture(root)
+    assert not [w for w in recwarn if "grey" in str(w.message)]
+    write_image(root / "images" / names[1], np.full((48, 64), 90, np.uint8))
+    warned(rf"1 of 3 photographs are grey \(first: {names[1]}\)", load_capture, root)
+    for name in names:
+        write_image(root / "images" / name, np.full((48, 64), 90, np.uint8))
+    recwarn.clear()
+    load_capture(root)
+    assert not [w for w in recwarn if "grey" in str(w.message)]

@@ -107,6 +107,19 @@ def test_realitycapture_angles_are_those_of_its_help(tmp_path):
     np.testing.assert_allclose(right[:2], [[1, 0, 0], [0, -1, 0]], atol=1e-12)
 
 
+def test_realitycapture_in_degrees_is_refused(tmp_path):
+    capture = files.Posed()
+    path = capture.write_images(tmp_path) / "registration.csv"
+    files.realitycapture(capture, path)
+    assert len(read(tmp_path)[0]) == 6
+    capture.centres = capture.centres * [1e-5, 0.9e-5, 1.0] + [13.4, 52.5, 80.0]
+    files.realitycapture(capture, path)
+    refused(ValueError, "registration.csv: x and y are longitudes and latitudes, .* UTM", read, tmp_path)
+    capture.centres = np.zeros((6, 3))  # a camera on a tripod
+    files.realitycapture(capture, path)
+    assert len(read(tmp_path)[0]) == 6
+
+
 def test_bundler(tmp_path):
     capture = files.Posed(cx=files.WIDTH / 2, cy=files.HEIGHT / 2, k=(-0.1, 0.02, 0.0), p=(0.0, 0.0))
     files.bundler(capture, capture.write_images(tmp_path) / "bundle.out")

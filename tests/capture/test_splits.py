@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from blitzgs.capture import colmap
 from blitzgs.capture.cameras import SourceView
 from blitzgs.capture.capture import load_capture
 from blitzgs.capture.splits import split_views
@@ -199,7 +200,8 @@ def models(root, counts, text=False):
     for number, count in enumerate(counts):
         folder = root / "sparse" / str(number)
         folder.mkdir(parents=True)
-        getattr(reconstruction(names[:count], 64, 48), "write_text" if text else "write_binary")(str(folder))
+        model = reconstruction(names[:count], 64, 48, around=len(names))
+        getattr(model, "write_text" if text else "write_binary")(str(folder))
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -218,6 +220,29 @@ def test_the_largest_of_several_models_is_read(tmp_path, counts, text):
     assert len(everything.cameras) == max(counts) and len(everything.points) == 20 * len(counts)
     with pytest.raises(FileNotFoundError, match="data.sparse: .*sparse/77 has no complete COLMAP model"):
         load_capture(tmp_path, sparse="sparse/77")
+
+
+def test_models_of_different_worlds_are_not_joined(tmp_path):
+    models(tmp_path, (4, 9))
+    assert len(load_capture(tmp_path, sparse="all").cameras) == 9
+    model = colmap.read_model(tmp_path / "sparse/0", points2d=True, tracks=True)
+    model.images.quats = np.roll(model.images.quats, 1, axis=1)
+    colmap.write_model(tmp_path / "sparse/0", model)
+    message = "data.sparse: 00.png is in two COLMAP models and looks elsewhere in the second"
+    refused(ValueError, message, load_capture, tmp_path, sparse="all")
+    assert len(load_capture(tmp_path, sparse="sparse/0").cameras) == 4
+
+
+def test_the_files_of_a_model_that_are_not_read_are_named(tmp_path):
+    models(tmp_path, (4,))
+    assert load_capture(tmp_path).about.notes == ()
+    reconstruction(["00.png"], 64, 48).write_text(str(tmp_path / "sparse/0"))
+    capture = load_capture(tmp_path)
+    assert len(capture.cameras) == 4
+    assert capture.about.notes == ("sparse/0/images.bin is read, and images.txt beside it not",)
+    (tmp_path / "sparse/0/cameras.bin").unlink()
+    notes = load_capture(tmp_path, sparse="sparse/0").about.notes
+    assert notes == ("sparse/0/images.txt is read, and images.bin beside it not",)
 
 
 def test_a_damaged_model_is_not_the_largest(tmp_path):

@@ -269,3 +269,7 @@ def test_an_unusual_lens_is_named():
     assert "focal lengths 60 and 120" in check_lens(Lens("PINHOLE", W, H, (60.0, 120.0, 32.0, 24.0)))
     assert "0.5, 0.5 at the corner" in check_lens(Lens("PINHOLE", W, H, (60.0, 60.0, 0.5, 0.5)))
     assert "principal point -3, 24 outside" in check_lens(Lens("PINHOLE", W, H, (60.0, 60.0, -3.0, 24.0)))
+    for scale in (0.5, 2):  # of a photograph that was resized, whose lens was not
+        centre = (W / 2 / scale, H / 2 / scale)
+        assert "far from the middle" in check_lens(Lens("PINHOLE", W, H, (60.0, 60.0, *centre)))
+    assert check_lens(Lens("PINHOLE", W, H, (60.0, 60.0, 0.62 * W, 0.4 * H))) == ""

@@ -19,12 +19,15 @@ from blitzgs.capture.capture import load_capture
 from blitzgs.capture.world import geodetic
 from blitzgs.cli import main
 from blitzgs.distributed.group import Ranks
+from blitzgs.formats.gaussians import triple_of
 from blitzgs.formats.models import FORMATS, offset_of, read_gaussians
 from blitzgs.formats.ply import write_ply
+from blitzgs.runs.source import open_source
 from blitzgs.runs.trained_model import open_model
 from blitzgs.runs.world import load_world_frame
 from blitzgs.viewer.panel import overlay
 from blitzgs.viewer.studio import open_model as open_viewed
+from blitzgs.viewer.web import open_city, web_file
 from blitzgs.viewer.world import Stance, World
 from tests.capture import helpers as files
 from tests.training.tiny import OVERRIDES, as_flags
@@ -141,6 +144,33 @@ def test_files_keep_their_place_in_the_world(whole, tmp_path, capsys):
         assert not (tmp_path / f"model.{kind}.offset.json").exists()
 
 
+@pytest.mark.parametrize("name", ["ply", "compressed-ply", "sog"])
+def test_files_state_background_and_up(whole, tmp_path, capsys, name):
+    source, path = tmp_path / "source.ply", tmp_path / f"model{FORMATS[name].suffix}"
+    stated = ["comment background 0.25 0.5 0.75", "comment up 1.0 0.0 0.0"]
+    model = read_gaussians(whole)
+    write_ply(source, **vars(dataclasses.replace(model, comments=stated)))
+    assert main(["export", str(source), f"--{name}", str(path)]) == 0
+    assert "over the background #4080bf: set this colour in viewers" in capsys.readouterr().out
+    opened = open_viewed(path, Ranks())
+    assert opened.exhibit.background == opened.subject.options.background == (0.25, 0.5, 0.75)
+    city = open_city(path)
+    assert city.scene.background == (0.25, 0.5, 0.75) and city.scene.up == (1, 0, 0)
+    assert '"up": [1.0, 0.0, 0.0]' in web_file(opened, 10**7).text
+    assert main(["export", str(path), "--glb", str(tmp_path / "a.glb")]) == 0
+    content = (tmp_path / "a.glb").read_bytes()
+    node = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])["nodes"][0]
+    np.testing.assert_allclose(Rotation.from_quat(node["rotation"]).apply([1, 0, 0]), [0, 1, 0], atol=1e-6)
+
+
+def test_header_lines_of_others_state_nothing(whole, tmp_path):
+    lines = ["comment background 2 0 0", "comment up 0 0 0", "comment offset a b c", "comment up nan 0 1"]
+    write_ply(tmp_path / "a.ply", **vars(dataclasses.replace(read_gaussians(whole), comments=lines)))
+    exhibit = open_viewed(tmp_path / "a.ply", Ranks()).exhibit
+    assert exhibit.background == (0, 0, 0) and exhibit.up is None
+    assert np.linalg.norm(exhibit.space.offset) < 1000
+
+
 def test_bad_gaussians_are_left_out_by_choice_and_no_model_replaces_itself(whole, tmp_path, failure):
     table, path = bytearray(whole.read_bytes()), tmp_path / "nan.ply"
     start = table.index(b"end_header\n") + len(b"end_header\n")
@@ -221,6 +251,9 @@ def test_control_points_give_the_world(trained, survey, tmp_path, capsys):
     assert main(["export", str(trained[1]), "--ply", str(tmp_path / "m.ply"), "--coordinates", "world"]) == 0
     offset = json.loads((tmp_path / "m.ply.offset.json").read_text())
     assert offset["crs"] == "EPSG:32632" and offset["meaning"].startswith("world coordinates = ")
+    up = triple_of(open_source(trained[1]).comments, "up")
+    there = triple_of(read_gaussians(tmp_path / "m.ply").comments, "up")
+    np.testing.assert_allclose(there, TURN @ up, atol=1e-9)
     # Into the next zone, where grid north is elsewhere: a turn by the convergence of both.
     pytest.importorskip("pyproj")
     assert main(["align", str(trained[1]), "--crs", "EPSG:32633"]) == 0

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """INRIA's interface renders, in float64, what the formulas of INRIA's code give, gradients included."""
 
+import re
+
 import pytest
 import torch
 
@@ -289,6 +291,35 @@ def test_screen_tensors_of_another_shape_are_named(name, shape):
     given = {"means2D": None, **without(leaves(7), "colors_precomp"), name: torch.zeros(shape)}
     message = rf"{name} must be \[N, 2 or more\] with N = {COUNT}, got \[{shape[0]}"
     refused(RuntimeError, message, inria.GaussianRasterizer(settings()), **given)
+
+
+@pytest.mark.parametrize(
+    "name, shape",
+    [
+        ("colors_precomp", (COUNT + 1, 3)), ("cov3D_precomp", (COUNT, 3, 3)), ("scales", (1, 3)),
+        ("rotations", (COUNT, 3)), ("bg", (2,)),
+    ],
+)  # fmt: skip
+def test_tables_of_another_shape_are_named(name, shape):
+    given, changes = without(leaves(7), "colors_precomp"), {}
+    if name == "bg":
+        changes = {name: torch.zeros(shape)}
+    else:
+        replaced = {"colors_precomp": ["shs"], "cov3D_precomp": ["scales", "rotations"]}.get(name, [])
+        # Rotations of another length take a path on which rows would broadcast.
+        given = {**without(given, *replaced), name: torch.ones(shape, dtype=torch.float64)}
+        if name == "scales":
+            given["rotations"] = 2 * given["rotations"]
+    message = re.escape(f"{name} must be ") + r".*" + re.escape(f", got {[*shape]}")
+    refused(RuntimeError, message, inria.GaussianRasterizer(settings(**changes)), means2D=None, **given)
+
+
+def test_matrices_may_have_a_batch_dimension_of_one():
+    given, plain = without(leaves(), "colors_precomp"), settings()
+    matrices = {name: getattr(plain, name)[None] for name in ("viewmatrix", "projmatrix")}
+    wanted, found = (inria.GaussianRasterizer(s) for s in (plain, settings(**matrices)))
+    assert torch.equal(found(means2D=None, **given)[0], wanted(means2D=None, **given)[0])
+    assert torch.equal(found.markVisible(given["means3D"]), wanted.markVisible(given["means3D"]))
 
 
 def test_visibility():

@@ -2,6 +2,7 @@
 """Groups of ranks, and sums over the ranks of a host."""
 
 import os
+import re
 import signal
 import subprocess
 import time
@@ -10,6 +11,7 @@ import pytest
 import torch
 from torch.distributed import HashStore
 
+from blitzgs.cli import main
 from blitzgs.distributed import watchdog
 from blitzgs.distributed.group import (
     ALLOCATOR_VARIABLES,
@@ -151,6 +153,39 @@ def test_a_bad_rank_ends_the_job_with_its_message(how, expected):
         assert "waited 3 s in all_reduce: rank 1 has not arrived" in failure.value.blame
     assert expected in failure.value.messages[0]
     assert expected in failure.value.messages[2]
+    if how in ("raise", "memory", "kill"):  # of which commands print no traceback
+        assert "UserError: rank 0: all_reduce failed" in failure.value.messages[0]
+
+
+def _start(rank, arguments):
+    watchdog.START_SECONDS = 3.0
+    if rank == 1:
+        return main(arguments) if arguments else None
+    if rank == 2:  # does something else first, as `with_poses` does
+        while arguments and not watchdog.early_failure():
+            time.sleep(0.1)
+        assert not arguments, watchdog.early_failure()
+        return None
+    return Ranks.from_environment("cpu", timeout_seconds=1.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["doctor", "--devise=cpu"], "rank 1 failed: wrong usage"),
+        (["eval", "/dev/null", "--device=cuda:99"], "rank 1 failed: ValueError: .* cuda:99"),
+        ([], r"has waited 3 s for ranks that have not started: 1, 2\. Look"),
+    ],
+)
+def test_a_rank_that_ends_before_it_joins_is_named(arguments, expected):
+    start = time.monotonic()
+    with pytest.raises(RankError) as failure:
+        run_ranks(_start, 3, arguments, join=False, limit=60)
+    messages = failure.value.messages
+    assert set(messages) == ({0, 1, 2} if "--devise=cpu" in arguments else {0, 2} if arguments else {0})
+    for rank in messages.keys() - {1}:
+        assert re.search(expected, messages[rank])
+    assert "UserError" in messages[0] and time.monotonic() - start < 45
 
 
 def _work(ranks, hang):

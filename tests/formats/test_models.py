@@ -23,7 +23,7 @@ from blitzgs.formats import packed
 from blitzgs.formats.gaussians import MIP, SH_C0, Gaussians
 from blitzgs.formats.models import FORMATS, check_replaces, read_gaussians, with_degree
 from blitzgs.runs.world import rotated_harmonics
-from tests.helpers import refused, some_gaussians
+from tests.helpers import glb_parts, refused, some_gaussians
 
 gaussforge = pytest.importorskip("gaussforge")
 gsply = pytest.importorskip("gsply")
@@ -215,6 +215,26 @@ def test_spz_keeps_far_positions_and_small_gaussians(tmp_path):
     assert (found.means - model.means).abs().max() <= float(model.scales.median().exp()) / 16
 
 
+def test_a_far_gaussian_does_not_round_the_others_in_spz(tmp_path):
+    """Its position has the range of the file's, whose steps would be 1 m."""
+    model = some_gaussians(200, 0)
+    near, step = model.means.clone(), float(model.scales.median().exp())
+    # As far as the steps that others need allow, it stays.
+    for far, left_out in ((1e4, 0), (3e6, 1)):
+        model.means[7, 2] = far
+        lost = FORMATS["spz"].write(tmp_path / "a.spz", model)
+        assert lost.left_out == left_out
+        assert bool(FORMATS["spz"].told(lost)) == bool(left_out)
+        others = torch.arange(200) != 7
+        found, kept = read_gaussians(tmp_path / "a.spz"), others | (left_out == 0)
+        assert len(found) == int(kept.sum())
+        away = (found.means - model.means[kept]).abs().amax(dim=1)
+        assert away.max() <= step / 8
+    assert (near[others] == model.means[others]).all()
+    model.means[:] = 1e8
+    refused(ValueError, "coordinates up to 4,194,304", FORMATS["spz"].write, tmp_path / "a.spz", model)
+
+
 def test_what_a_format_cannot_say_is_told(model):
     with_levels = some_gaussians(3, 1, levels=True)
     assert not FORMATS["ply"].unstated(replace(with_levels, comments=[MIP]))
@@ -225,13 +245,25 @@ def test_what_a_format_cannot_say_is_told(model):
         assert ("octree levels" in told) == (name not in ("ply", "glb")), name
 
 
-def test_gaussians_beyond_the_ranges_of_spz_are_told(tmp_path):
-    model = some_gaussians(9, 0)
-    assert not FORMATS["spz"].unstated(model)
-    model.scales[0, 1], model.sh[1:3, 0, 2] = 7.0, 4.0
-    assert "3 Gaussians" in (told := " ".join(FORMATS["spz"].unstated(model)))
-    found = read_gaussians(written(tmp_path, "spz", model))
-    assert f"{found.scales[0, 1].exp():.0f} units" in told
+@pytest.mark.parametrize("name", ["spz", "splat"])
+def test_gaussians_beyond_the_ranges_of_a_format_are_told(tmp_path, name):
+    path, kind = tmp_path / "a", FORMATS[name]
+    model = some_gaussians(9, 1)
+    model.sh[:, 0].clamp_(max=1)
+    model.sh[:, 1:].clamp_(-1, 1)
+    assert kind.write(path, model) == (0, 0) and not kind.told(packed.Lost())
+    model.scales[0, 1], model.sh[1:3, 0, 2], model.sh[4, 3, 1] = 7.0, 4.0, -1.1
+    model.scales[5], model.scales[6, 0] = -12.0, -12.0  # the thickness of a disc may be rounded
+    lost = kind.write(path, model)
+    assert lost == (5 if name == "spz" else 2, 0)
+    (told,) = kind.told(lost)
+    assert f"{lost.cut} Gaussians were cut to that" in told
+    if name == "splat":
+        assert splat_by_hand(path).sh[1, 0, 2] * SH_C0 == pytest.approx(0.5)
+        return
+    found = read_gaussians(path)
+    assert found.sh[4, 3, 1] == -1
+    assert f"{found.scales[5, 0].exp():.6f} to {found.scales[0, 1].exp():.0f} units" in told
     assert f"{0.5 + SH_C0 * found.sh[1, 0, 2]:.2f} of white" in told
 
 
@@ -339,6 +371,17 @@ def damaged_splats(path):
 DAMAGED = {
     "compressed-ply": damaged_plys, "splat": damaged_splats, "spz": damaged_spzs, "sog": damaged_sogs
 }  # fmt: skip
+
+
+def test_comments_keep_their_letters(tmp_path, model):
+    lines = ["comment Größe \u2028", os.fsdecode(b"comment Gr\xf6\xdfe"), "obj_info a"]
+    for name in ("ply", "compressed-ply"):
+        path = written(tmp_path, name, replace(model, comments=lines))
+        assert read_gaussians(path).comments == lines
+        path.write_bytes(path.read_bytes().replace(b"a\nelement", b"a\r\nelement"))
+        assert read_gaussians(path).comments == lines
+    content, _ = glb_parts(written(tmp_path, "glb", replace(model, comments=lines)))
+    assert content["asset"]["extras"]["comments"][:2] == [lines[0], "comment Gr??e"]
 
 
 @pytest.mark.parametrize("name", PACKED)

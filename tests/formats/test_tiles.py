@@ -135,6 +135,23 @@ def test_tiles_with_spz_inside_say_so_and_are_turned_back(tmp_path):
     np.testing.assert_allclose(np.sort(np.concatenate(found), axis=0), np.sort(wanted, axis=0), atol=1e-3)
 
 
+def test_tiles_with_spz_count_what_it_cannot_hold(tmp_path):
+    pytest.importorskip("gsply")
+    model = city(800, levels=False)
+    model.sh.clamp_(-1, 1)
+    model.means[3, 0], model.scales[4] = 3e7, 7.0
+    done = write_tiles(tmp_path / "t", model, np.eye(4), SCENE, "the city", most=300, spz=True)
+    assert done.gaussians == 799 and done.lost == (1, 1)
+    tileset = json.loads((tmp_path / "t" / "tileset.json").read_text())
+    held = 0
+    for node, _ in nodes(tileset["root"]):
+        content, _ = glb_parts(tmp_path / "t" / node["content"]["uri"])
+        count = content["accessors"][0]["count"]
+        assert count == node["content"]["extras"]["gaussians"]
+        held += 0 if "children" in node else count
+    assert held == 799 and np.abs(corners(tileset["root"]["content"]["boundingVolume"])).max() < 1e6
+
+
 def test_errors_fall_and_volumes_hold_what_is_inside(written):
     _, path, _, tileset = written
     for node, parent in nodes(tileset["root"]):

@@ -174,6 +174,8 @@ def test_empty_and_one_splat():
 
 def test_errors_name_the_value_of_intersect():
     splats = random_splats(3, WIDTH, HEIGHT)
+    message = "camera_ids must be a torch.Tensor, got NoneType"
+    refused(TypeError, message, intersect, *splats.geometry()[:4], None, **GRID)
     with pytest.raises(RuntimeError, match=r"conics must have shape \[3, 3\], got \[3, 2\]"):
         intersect(splats.means2d, splats.conics[:, :2], *splats.geometry()[2:], **GRID)
     with pytest.raises(RuntimeError, match="camera_ids must be Int"):

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -282,6 +283,7 @@ def test_errors_name_the_argument():
         refused(RuntimeError, "eps2d must .* radius_clip at least 0", project_scene, scene, **wrong)
     refused(RuntimeError, "at most 32 views in .*, got 33", project_scene, random_scene(n=1, cameras=33))
     refused(RuntimeError, "active_ids must .* got Long", project_scene, scene, active_ids=torch.arange(2))
+    refused(TypeError, "Ks must be a torch.Tensor, got NoneType", project_scene, replace(scene, Ks=None))
 
 
 def inputs_of(scene):

@@ -10,7 +10,7 @@ import torch
 from blitzgs.ops.intersect import intersect, tile_counts
 from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.ops.rasterize import GradientBuffer, gradient_columns, gradient_table_of, rasterize
-from tests.helpers import on_threads
+from tests.helpers import on_threads, refused
 from tests.ops.splats import Splats, by_definition, kept_by, random_splats
 from tests.ops.test_photometric import images
 
@@ -286,6 +286,8 @@ def test_errors_name_the_value():
         rasterize(*splats.values(), *tile_lists, **options, backgrounds=torch.zeros(2, 3))
     with pytest.raises(RuntimeError, match=r"tile_offsets must have shape \[13\], got \[12\]"):
         rasterize(*splats.values(), tile_lists[0], tile_lists[1][:-1], **options)
+    message = "colors must be a torch.Tensor, got NoneType"
+    refused(TypeError, message, rasterize, *splats.values()[:3], None, *tile_lists, **options)
 
 
 @pytest.mark.parametrize(

@@ -99,6 +99,25 @@ def test_rotations_are_rotations_for_any_quaternion():
     assert torch.allclose(torch.linalg.det(R), torch.ones(4, dtype=torch.float64))
 
 
+@pytest.mark.parametrize(
+    "name, value, message",
+    [
+        ("viewmat", torch.eye(4)[None], r"viewmat must be \[4, 4\], got \[1, 4, 4\]"),
+        ("viewmat", torch.eye(4)[:3], r"viewmat must be \[4, 4\], got \[3, 4\]"),
+        ("scales", torch.ones(1, 3), r"scales must be \[5, 3\], got \[1, 3\]"),
+        ("colors", torch.ones(5, 3, 3), r"colors must be \[5, 4, 3\], got \[5, 3, 3\]"),
+        ("sh_degree", None, r"colors must be \[5, 3\], got \[5, 16, 3\]"),
+        ("sh_degree", 4, "sh_degree must be 0 to 3 or None, got 4"),
+        ("render_mode", "rgb", "render_mode must be one of RGB, .*, got 'rgb'"),
+    ],
+)
+def test_what_does_not_fit_is_named(name, value, message):
+    scene = random_scene(n=5, cameras=1)
+    given = {key: getattr(scene, key) for key in ("means", "quats", "scales", "opacities", "colors")}
+    given |= {"viewmat": scene.viewmats[0], "K": scene.Ks[0], "sh_degree": 1, name: value}
+    refused(ValueError, message, render, width=8, height=8, **given)
+
+
 def test_non_finite_gaussians_spread_nowhere_not_even_into_gradients():
     scene = random_scene(n=20, cameras=1)
     clean = reference_images(scene)[0]

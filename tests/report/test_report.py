@@ -259,6 +259,28 @@ def test_a_comparison_has_what_differs(trained, other):
     assert shown == ["photograph", "run, render", "short, render", "run, error", "short, error"]
 
 
+def test_a_comparison_of_other_cameras_says_so(trained, tmp_path):
+    run = tmp_path / "changed"
+    shutil.copytree(trained[1], run)
+    stored = json.loads((run / "cameras.json").read_text())
+
+    def notes(**changes):
+        cameras = [camera | changes.get("each", {}) for camera in stored["cameras"]]
+        lists = {"cameras": cameras, "test": changes.get("test", stored["test"])}
+        (run / "cameras.json").write_text(json.dumps(stored | lists))
+        return " ".join(data_of(compare([trained[1], run]))["left_out"])
+
+    assert notes() == ""
+    for changes, differs in (
+        ({"each": {"width": 9}}, "sizes of images"),
+        ({"each": {"world_to_camera": np.eye(4).tolist()}}, "poses"),
+        ({"test": stored["test"] + stored["train"][:1]}, "held-out views"),
+        ({"each": {"name": "a.jpg"}}, "photographs, held-out views"),
+    ):
+        with pytest.warns(UserWarning, match=f"changed has other {differs} than run, so"):
+            assert f"changed has other {differs} than run" in notes(**changes)
+
+
 @pytest.fixture(scope="module")
 def browser(trained):
     with Browser("about:blank") as browser:
@@ -377,11 +399,19 @@ def test_hostile_names_are_shown_as_they_are(trained, tmp_path, browser):
         content["views"] = dict(zip(names, content["views"].values(), strict=True))
         return content
 
-    folder = copied(trained, tmp_path / "run", cameras=renamed, metrics=measured)
+    def widths(kind):
+        return browser.evaluate(f"[...document.querySelectorAll('{kind}')].map(e => e.offsetWidth)")
+
+    folder = copied(trained, tmp_path / ("x" * 200), cameras=renamed, metrics=measured)
+    page = tmp_path / "compare.html"
+    assert main(["compare", str(trained[1]), str(folder), "--out", str(page)]) == 0
+    opened(browser, page)
+    assert sum(widths("#figures th")) <= browser.evaluate("innerWidth")
     assert main(["report", str(folder)]) == 0
     opened(browser, folder / "report.html")
+    assert widths(".thumb") and set(widths(".thumb")) == {118}
     assert HOSTILE in column(browser, "views", 0)[0]
     time.sleep(0.3)
-    assert browser.evaluate("document.title") == "run · report"
+    assert browser.evaluate("document.title") == f"{folder.name} · report"
     assert browser.evaluate("document.querySelectorAll('img[src=x]').length") == 0
     assert browser.errors() == []

@@ -26,7 +26,7 @@ from blitzgs.runs import checkpoint
 from blitzgs.runs.evaluation import correct_colours, image_metrics, load_lpips
 from blitzgs.runs.export import export
 from blitzgs.runs.folder import open_run
-from blitzgs.runs.source import open_source, source_of
+from blitzgs.runs.source import open_source, source_of, up_of_run
 from blitzgs.runs.world import in_world, rotated_harmonics
 from tests.helpers import export_ply, refused, save_checkpoint, ssim_map
 
@@ -86,7 +86,7 @@ def test_lpips_is_a_torchscript_module(tmp_path):
 def test_a_checkpoint_is_streamed_with_its_pending_steps(trained, tmp_path, monkeypatch):
     monkeypatch.setattr(blocks, "BLOCK", 100)
     model, streamed = open_run(trained[1]).model(), open_source(trained[1])
-    whole = source_of(model)
+    whole = source_of(model, up_of_run(trained[1], model.space))
     assert len(streamed) == len(whole) == len(model) > 300 and streamed.comments == whole.comments
     sizes = [len(block) for block in streamed.blocks()]
     assert max(sizes) == 100 and sum(sizes) == len(model)
@@ -95,7 +95,7 @@ def test_a_checkpoint_is_streamed_with_its_pending_steps(trained, tmp_path, monk
         expected = torch.cat([getattr(block, name) for block in whole.blocks()])
         assert torch.equal(found, expected), name
     export(streamed, streamed.space, FORMATS["ply"], tmp_path / "a.ply")
-    export_ply(model, tmp_path / "b.ply")
+    export(whole, model.space, FORMATS["ply"], tmp_path / "b.ply")
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from blitzgs.capture.capture import load_capture
 from blitzgs.capture.world import frame_beside, geodetic
@@ -23,9 +24,10 @@ from blitzgs.cli import sfm as command
 from blitzgs.config.files import load_config
 from blitzgs.sfm import engine, reconstruct
 from blitzgs.sfm.photographs import Photographs, estimate, judge_positions
-from blitzgs.sfm.pycolmap_stage import features
+from blitzgs.sfm.pycolmap_stage import features, pairs
 from blitzgs.sfm.reconstruct import Settings
 from blitzgs.sfm.report import Reconstruction, _reason, examine
+from blitzgs.util.errors import UserError
 from tests.capture.helpers import Posed, opensfm, pix4d, realitycapture, warned, write_image
 from tests.sfm.scene import FOCAL, aligned, with_gps, write_photographs
 from tests.training.tiny import OVERRIDES, as_flags
@@ -177,6 +179,33 @@ def test_interrupted_work_goes_on_and_is_placed_by_gps(tmp_path, monkeypatch):
     assert not (tmp_path / "images").is_symlink()
 
 
+@pytest.mark.parametrize("altitude", [True, False])
+def test_a_receiver_without_a_fix_says_no_place(tmp_path, altitude):
+    placed = write_photographs(tmp_path / "images", 3)
+    with_gps(tmp_path / "images", placed, altitude)
+    path = tmp_path / "images/view_0.jpg"
+    with Image.open(path) as photo:
+        exif = photo.getexif()
+        exif.get_ifd(0x8825).update({2: (0.0, 0.0, 0.0), 4: (0.0, 0.0, 0.0)})
+        photo.save(path, exif=exif)
+    job = {"photos": str(tmp_path / "images"), "names": [f"view_{i}.jpg" for i in range(3)], "masks": ""}
+    database = tmp_path / "database.db"
+    features({**job, "database": str(database), "camera_model": "auto"})
+    assert sorted(engine.read_positions(database)) == ["view_1.jpg", "view_2.jpg"]
+    features({**job, "database": str(database), "camera_model": "auto"})  # as later photographs are added
+    assert sorted(engine.read_positions(database)) == ["view_1.jpg", "view_2.jpg"]
+    assert engine.lack_places(str(database), job["names"])
+    assert not engine.lack_places(str(database), job["names"][1:])
+    origin = tmp_path / "georeference.json"
+    by_gps = {"pairs": "gps", "gps": True, "use_altitude": altitude, "georeference": str(origin)}
+    pairs({**job, **by_gps, "database": str(database)})
+    # It has no neighbours by GPS, but by name, and is not the origin of the world.
+    assert engine.read_found(database)["view_0.jpg"].neighbours == 2
+    assert json.loads(origin.read_text())["latitude"] == pytest.approx(47.0, abs=0.01)
+    with pycolmap.Database.open(database) as opened:
+        assert len({prior.coordinate_system for prior in opened.read_all_pose_priors()}) == 1
+
+
 def test_a_camera_of_exif_is_another_camera(tmp_path):
     """Features alone: cameras are made of EXIF, and without it of size and folder."""
     placed = write_photographs(tmp_path / "photos", 4)
@@ -272,6 +301,14 @@ def test_what_cannot_work_is_said(tmp_path, monkeypatch, capsys):
         patch.setattr("importlib.util.find_spec", lambda name: None)
         patch.setenv("PATH", "")
         assert "pip install 'blitzgs[sfm]'" in message("photos", "capture")
+    with monkeypatch.context() as patch:
+
+        def refuse(link, *args, **kwargs):
+            raise PermissionError(1, "Operation not permitted", link)
+
+        patch.setattr(Path, "symlink_to", refuse)
+        assert "photos (Operation not permitted): choose a capture on a disk" in message("photos", "exfat")
+        assert not (tmp_path / "exfat/sfm/database.db").exists()
     (tmp_path / "photos/view_1.jpg").write_bytes(b"hello")
     assert "3 photographs are needed, 2 can be used" in message("photos", "capture")
 
@@ -302,6 +339,24 @@ def test_photographs_in_other_formats_are_named(tmp_path):
     Photographs.of(tmp_path)
     (tmp_path / "view_9.heic").write_bytes(b"")
     warned(r"only its 3 photographs are used; \.heic cannot be read: convert", Photographs.of, tmp_path)
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".avif", ".jp2", ".gif"])
+def test_photographs_that_colmap_does_not_read_are_left_out(tmp_path, suffix):
+    write_photographs(tmp_path, 3)
+    shown = cv2.imread(str(tmp_path / "view_0.jpg"))
+    write_image(tmp_path / f"view_7{suffix.upper()}", shown)
+    assert pycolmap.Bitmap.read(tmp_path / f"view_7{suffix.upper()}", False) is None
+    found = Photographs.of(tmp_path)
+    assert len(found.names) == 3
+    assert found.damage == {
+        f"view_7{suffix.upper()}": f"COLMAP reads no {suffix.upper()} files: convert it to JPEG or PNG"
+    }
+    (tmp_path / "view_1.jpg").unlink()
+    with pytest.raises(
+        ValueError, match=f"3 photographs are needed, 2 can be used; COLMAP reads no {suffix.upper()}"
+    ):
+        Photographs.of(tmp_path)
 
 
 def test_photographs_alone_are_recognised(tmp_path, capsys):
@@ -348,6 +403,14 @@ def test_other_ranks_wait_for_rank_0(tmp_path, monkeypatch):
     (tmp_path / "capture/sfm/report.json").write_text("{}")
     thread.join(10)
     assert [config.data.path for config in results] == [str(tmp_path / "capture")]
+
+
+def test_other_ranks_end_if_rank_0_fails(tmp_path, monkeypatch):
+    write_photographs(tmp_path / "photos", 3)
+    monkeypatch.setenv("RANK", "1")
+    monkeypatch.setattr("blitzgs.distributed.watchdog.early_failure", lambda: "rank 0 failed: no pairs")
+    with pytest.raises(UserError, match="there are no poses, because rank 0 failed: no pairs"):
+        command.with_poses(config_of(tmp_path / "photos"), tmp_path / "capture")
 
 
 @pytest.mark.slow

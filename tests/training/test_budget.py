@@ -18,6 +18,7 @@ from blitzgs.config.ranges import problems
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import run_files, trained_model
+from blitzgs.runs.resume import check_before_capture, check_resumable
 from blitzgs.training.budget import Budget, extended
 from blitzgs.training.replay import replay
 from blitzgs.training.trainer import Trainer
@@ -300,7 +301,17 @@ def test_an_interrupted_extension_ends_as_an_uninterrupted_one(tmp_path, monkeyp
     assert_same_table(*tables)
 
 
-def test_an_extension_that_was_killed_before_its_first_checkpoint_can_be_repeated(tmp_path):
+@pytest.mark.parametrize("by", [1.4, None])
+def test_an_extension_that_was_killed_before_its_first_checkpoint_goes_on(tmp_path, by):
     train(tmp_path)
     extend(tmp_path, 1.4).close()  # its configuration is written, its checkpoint is not
-    assert extend(tmp_path, 1.4).train()["images"] == 140
+    check_before_capture(tmp_path, load_config(tmp_path / run_files.CONFIG), extends=False)
+    assert extend(tmp_path, by).train()["images"] == 140
+
+
+def test_only_a_finished_run_becomes_longer():
+    longer = tiny_config("schedule.iterations=140")
+    check_resumable(tiny_config(), longer, step=100)
+    check_resumable(tiny_config("schedule.minutes=5"), longer, step=100)
+    refused(ConfigError, "schedule.iterations", check_resumable, tiny_config(), longer, 99)
+    refused(ConfigError, "schedule.iterations", check_resumable, longer, tiny_config(), 140)

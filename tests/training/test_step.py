@@ -27,7 +27,8 @@ from blitzgs.table.table import GaussianTable
 from blitzgs.training.batches import Batch
 from blitzgs.training.exposure import Exposures, _log_gains, exposures_differ, track_gains
 from blitzgs.training.inputs import open_capture
-from blitzgs.training.loss import loss_terms, opacity_term, photometric, scale_term, weighted
+from blitzgs.training.loss import batch_psnr, loss_terms, opacity_term, photometric, scale_term, weighted
+from blitzgs.training.records import measure_step
 from blitzgs.training.step import Stepper
 from blitzgs.training.trainer import Trainer
 from blitzgs.view.gate import ViewGate
@@ -254,6 +255,23 @@ def test_the_training_psnr_is_that_of_the_images_of_the_loss(tmp_path, monkeypat
         monkeypatch.setattr(path, partial(call, pkgutil.resolve_name(path)))
     train_on_unequal_photographs(tmp_path)
     assert torch.equal(*compared[-2:])  # of the last step, which is logged
+
+
+@pytest.mark.parametrize("background", ["[0.2, 0.3, 0.4]", "[0, 0, 0]"])
+def test_the_training_psnr_is_that_over_the_background_of_the_run(tmp_path, monkeypatch, background):
+    """Random colours behind a view that no Gaussian covers would decide on its PSNR."""
+    compared = []
+
+    def measure(state, frame, batch):
+        expected = render_frame(state.table, frame.views, state.render_options).renders
+        assert (frame.renders - expected).abs().mean() > 0.01
+        compared.append(batch_psnr(frame, batch, expected).item())
+        return measure_step(state, frame, batch)
+
+    monkeypatch.setattr("blitzgs.training.trainer.measure_step", measure)
+    options = ("model.random_background=true", f"model.background={background}", "schedule.iterations=20")
+    train(tmp_path, *options)
+    assert [record["psnr"] for record in steps_of(tmp_path)] == pytest.approx(compared, abs=1e-4)
 
 
 def test_a_resumed_run_repeats_every_bit_and_a_render_shows_the_exposures(tmp_path):

@@ -2,6 +2,7 @@
 import dataclasses
 import json
 import shutil
+import warnings
 from functools import partial
 
 import cv2
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from blitzgs.cli import main
 from blitzgs.config.files import ConfigError, load_config, to_dict
 from blitzgs.distributed.group import Ranks
 from blitzgs.runs import run_files, trained_model
@@ -213,6 +215,22 @@ def test_with_random_backgrounds_axes_are_limited(tmp_path, strategy, share):
     excess = (table["scales"].exp().amax(dim=1) / limits).max()
     # Steps that a row owes when it is seen for the last time may still move it a little.
     assert excess < 1.01 if share else excess > 1.5
+
+
+def test_a_run_that_starts_from_a_file_says_what_it_makes_smaller(tmp_path):
+    trainer, _ = train(tmp_path / "first", "schedule.iterations=20")
+    assert main(["export", str(tmp_path / "first"), "--ply", str(tmp_path / "model.ply")]) == 0
+    start, share = f"model.start={tmp_path / 'model.ply'}", "population.prune_world_scale"
+    table, extent = trainer.state.table, trainer.state.space.extent
+    larger = int((table["scales"].exp().amax(1) > 0.01 * table["means"].norm(dim=1).clamp(min=extent)).sum())
+    assert larger > 0
+    with pytest.warns(UserWarning, match=f"{larger} of the {len(table)} Gaussians of .*{share}=0 keeps"):
+        make_trainer(tmp_path / "second", start, f"{share}=0.01", "model.random_background=true")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again = make_trainer(tmp_path / "third", start, f"{share}=0", "model.random_background=true")
+    scales, others = (t["scales"][t["means"][:, 0].argsort()] for t in (table, again.state.table))
+    torch.testing.assert_close(scales, others)
 
 
 @pytest.mark.parametrize("white", [0, 1], ids=["black", "inverted"])

@@ -26,13 +26,24 @@ from blitzgs.training.understood import (
     _exposure,
     _grown,
     _look,
+    _warn_of_pictures,
     check_worlds,
     estimate,
     large_images_hint,
     undistortion_note,
 )
+from tests.capture.helpers import smooth_image
 from tests.helpers import refused
-from tests.training.tiny import HEIGHT, OVERRIDES, WIDTH, as_flags, tiny_config, write_tiny_capture
+from tests.training.tiny import (
+    HEIGHT,
+    OVERRIDES,
+    WIDTH,
+    Camera,
+    Capture,
+    as_flags,
+    tiny_config,
+    write_tiny_capture,
+)
 
 FLAGS = as_flags("config=defaults", *OVERRIDES, "schedule.iterations=10")
 
@@ -118,7 +129,10 @@ def test_a_damaged_photograph_is_counted_once():
         return torch.full((2, 2, 3), 90, dtype=torch.uint8)
 
     images = SimpleNamespace(prefetch=list, get=get, mask=lambda index: None)
-    said = _exposure(_look(SimpleNamespace(train=list(range(8))), images))
+    cameras = [Camera(f"{i:02d}.png", 4, 4, np.eye(3), np.eye(4)) for i in range(8)]
+    nothing = np.zeros((0, 3))
+    capture = SimpleNamespace(train=list(range(8)), cameras=cameras, points=nothing, colors=nothing)
+    said = _exposure(_look(capture, images))
     assert said == "means of 4 photographs 90 to 90 of 255 (0.0 stops); 1 cannot be read: 07.png: truncated"
 
 
@@ -131,6 +145,40 @@ def test_a_black_or_saturated_picture_is_predicted(data, capsys, value, what):
         cv2.imwrite(str(path), np.full((HEIGHT, WIDTH, 3), value, np.uint8))
     _, _, _, said = check(data, capsys)
     assert [text for text in said if f"photographs that were looked at are {what}" in text]
+
+
+@pytest.mark.parametrize("wrong", [(), (3,), range(6)])
+@pytest.mark.parametrize("change", ["another", "turned", "mirrored", "cropped"])
+def test_photographs_that_do_not_show_the_points_are_named(change, wrong):
+    """Six cameras look straight down on a map; a pixel is a unit of length."""
+    random = np.random.default_rng(0)
+    ground, k = smooth_image(150, 200, 5), np.array([[60, 0, 32], [0, 60, 24], [0, 0, 1.0]])
+    points = np.concatenate([random.uniform(0, [200, 150], (3000, 2)), np.zeros((3000, 1))], axis=1)
+    colors = ground[points[:, 1].astype(int), points[:, 0].astype(int)] // 2 + 20  # another exposure
+    cameras, shown = [], []
+    for i in range(6):
+        left, top = 22 * i, 16 * i
+        pose = np.eye(4)
+        pose[:3, 3] = [-left - 32, -top - 24, 60]
+        cameras.append(Camera(f"{i}.png", 64, 48, k, pose))
+        image = ground[top : top + 48, left : left + 64]
+        if i in wrong:
+            image = {
+                "another": ground[top : top + 48, left + 25 - 50 * (i > 4) :][:, :64],
+                "turned": image[::-1, ::-1],
+                "mirrored": image[:, ::-1],
+                "cropped": cv2.resize(image[10:-10, 13:-13], (64, 48)),
+            }[change]
+        shown.append(torch.from_numpy(image.copy()))
+    capture = Capture(cameras, points, colors, list(range(6)), [], 1.0)
+    images = SimpleNamespace(prefetch=list, get=shown.__getitem__, mask=lambda index: None)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        _warn_of_pictures(capture, _look(capture, images), 0.01)
+    said = [str(w.message) for w in caught if "other colours than the points" in str(w.message)]
+    assert len(said) == bool(wrong)
+    if len(wrong) == 1:
+        assert said[0].startswith("1 of 6 photographs") and "(first: 3.png)" in said[0]
 
 
 def test_a_near_plane_beyond_the_points_is_predicted(data, capsys):

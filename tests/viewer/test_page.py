@@ -251,6 +251,11 @@ def test_a_ply_file_behind_a_token(trained, tmp_path):
             text = "document.body.innerText"
             wait_for(lambda: "Keys: W A S D" in browser.evaluate(text), 20, "the help is there")
             assert browser.errors() == [] and "frustum" not in browser.evaluate(text)
+        with Browser(url, 390, 844) as phone:  # most of which is not covered by the panel
+            wait_for(phone.figures, 60, "the figures are there")
+            at = "document.elementFromPoint(300, {}).closest('.mantine-Paper-root') !== null"
+            wait_for(lambda: phone.evaluate(at.format(620)), 20, "the panel is there")
+            wait_for(lambda: not phone.evaluate(at.format(480)), 5, "the panel is low")
 
 
 def test_the_live_page_follows_a_training(tmp_path, monkeypatch):

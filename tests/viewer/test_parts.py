@@ -14,7 +14,7 @@ import pytest
 from blitzgs.runs.cameras import RunCamera
 from blitzgs.view.draw import intrinsics
 from blitzgs.view.look import Picture
-from blitzgs.view.views import Space
+from blitzgs.view.views import Space, up_direction
 from blitzgs.viewer import compare, paths
 from blitzgs.viewer.compare import shaded
 from blitzgs.viewer.door import Door, is_loopback
@@ -23,7 +23,7 @@ from blitzgs.viewer.frustums import MAX_FRUSTUMS, shown_cameras
 from blitzgs.viewer.live import Curves
 from blitzgs.viewer.panel import round_length
 from blitzgs.viewer.settings import Pace
-from blitzgs.viewer.world import World, looking, up_direction
+from blitzgs.viewer.world import World, looking
 from tests.helpers import refused
 
 

@@ -99,6 +99,11 @@ def test_the_picture_is_that_of_our_renderer(browser, tmp_path, comments, degree
     assert browser.errors() == []
 
 
+def test_a_long_name_stays_in_its_panel(browser, tmp_path):
+    show(browser, write_model(tmp_path / f"{'x' * 200}.ply", count=30), tmp_path)
+    assert browser.evaluate("((e) => e.scrollWidth <= e.clientWidth)(document.getElementById('panel'))")
+
+
 def test_mouse_and_wheel_move_and_reset_goes_back(browser, tmp_path):
     opened = write_model(tmp_path / "m.ply", count=600)
     show(browser, opened, tmp_path)

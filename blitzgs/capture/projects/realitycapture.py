@@ -9,7 +9,8 @@ CSV ("Internal/External camera parameters"; the program's export template and it
   axes right, up and backwards. All 0 looks straight down with north above.
 - Brown's model with k1 to k4. t1 belongs to r^2 + 2 x^2, as OpenCV's p2: the program's own OpenCV template
   writes t2 before t1.
-- x, y and alt are coordinates of the export's reference system, which the file does not name.
+- x, y and alt are coordinates of the export's reference system, which the file does not name; one of degrees
+  is refused.
 
 Bundler's bundle.out, version 0.3, which Metashape and others export too (N. Snavely, Bundler v0.4 User's
 Manual):
@@ -61,7 +62,7 @@ def read_realitycapture(path: Path) -> Project:
     lines = read_text(path).splitlines()
     first = next(i for i, line in enumerate(lines[:2]) if set(_NEEDED) <= set(_columns(line)))
     columns = _columns(lines[first])
-    views = []
+    views, centres = [], []
     rows = csv.reader(lines[first + 1 :], delimiter=_separator(lines[first]))
     for place, row in enumerate(rows, start=first + 2):
         if not row or row[0].startswith("#"):
@@ -73,11 +74,28 @@ def read_realitycapture(path: Path) -> Project:
             values = {key: number(cells, key) for key in columns if key in _NUMBERS}
             # Of axes right, up and backwards; ours are right, down and forward.
             rotation = turn("z", -values["heading"]) @ turn("x", values["pitch"]) @ turn("y", values["roll"])
-            pose = pose_of(rotation * [1, -1, -1], [values["x"], values["y"], values["alt"]])
+            centre = [values["x"], values["y"], values["alt"]]
+            pose = pose_of(rotation * [1, -1, -1], centre)
+        centres.append(centre)
         views.append(ProjectView(cells["name"].strip(), functools.partial(_lens, values), pose))
+    _check_metres(np.array(centres).reshape(-1, 3))
     return Project(views)
 
 
+def _check_metres(centres: Float64) -> None:
+    """Refuse longitudes and latitudes beside heights in metres [N, 3]: such cameras are above each other."""
+    if len(centres) < 2:
+        return
+    east, north, up = np.ptp(centres, axis=0)
+    if (np.abs(centres[:, :2]) <= [180, 90]).all() and up > _ABOVE * max(east, north):
+        raise ValueError(
+            f"x and y are longitudes and latitudes, as they differ by {max(east, north):.3g} and alt by "
+            f"{up:.3g}: export in local coordinates or a projected system, such as a UTM zone"
+        )
+
+
+# So many times more do cameras differ in alt than in x and y where these are degrees.
+_ABOVE = 50
 _NUMBERS = (*_NEEDED[1:], "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 
 
