@@ -26,7 +26,7 @@ from torch import Tensor
 from blitzgs import rasterization
 from blitzgs.frame.render import RenderOptions, backward_splats, inputs_of, render_frame, stage_ended
 from blitzgs.frame.transport.protocol import LocalTransport, stages_told_to
-from blitzgs.ops.projection_types import Views, WeightedViews
+from blitzgs.ops.projection_types import Views
 from blitzgs.table.table import GaussianTable
 
 try:
@@ -76,7 +76,7 @@ class OurRender:
         del self.frame, splats
         inputs = inputs_of(self.table, self.views, OPTIONS)
         ops.project_bwd(
-            list(inputs.gaussians), *WeightedViews(*inputs.cameras), *columns, None, *inputs.options,
+            list(inputs.gaussians), *inputs.cameras, None, None, *columns, None, *inputs.options,
             v_splats, None, False,
         )  # fmt: skip
         stage_ended("project back")

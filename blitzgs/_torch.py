@@ -23,6 +23,8 @@ below_autograd = torch._C._AutoDispatchBelowAutograd
 func_transforms_are_active = torch._C._are_functorch_transforms_active
 # Returns the hooks on saved tensors, which checkpointing uses, or None; the argument is True.
 hooks_on_saved_tensors = torch._C._autograd._top_saved_tensors_default_hooks
+# Return the indices and the values of a sparse tensor whether it is coalesced or not.
+raw_indices, raw_values = Tensor._indices, Tensor._values
 
 
 def current_stream_numbers(device_index: int) -> tuple[int, int, int]:
@@ -42,16 +44,6 @@ def refusing_derivatives(
     """Return tensors that depend on `inputs` in autograd's graph, where a backward pass raises an error."""
     refuse = torch._C._functions.DelayedError(message.encode(), len(tensors) + len(inputs))
     return tuple(refuse(*tensors, *inputs)[: len(tensors)])
-
-
-def raw_indices(table: Tensor) -> Tensor:
-    """Return the indices of a sparse tensor whether it is coalesced or not."""
-    return table._indices()
-
-
-def raw_values(table: Tensor) -> Tensor:
-    """Return the values of a sparse tensor whether it is coalesced or not."""
-    return table._values()
 
 
 def not_compiled(function: _F) -> _F:

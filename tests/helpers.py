@@ -22,7 +22,6 @@ from blitzgs.formats.gaussians import Gaussians
 from blitzgs.formats.models import FORMATS
 from blitzgs.frame.render import Frame, backward_splats
 from blitzgs.ops.photometric import report_
-from blitzgs.ops.projection_types import WeightedViews
 from blitzgs.reference import ReferenceImage, render
 from blitzgs.runs.checkpoint import Saving
 from blitzgs.runs.export import Exported, export
@@ -211,6 +210,11 @@ def refused(error: type[Exception], text: str, call: Callable, /, *given: Any, *
         call(*given, **named)
 
 
+def opcheck_eager(op: Any, arguments: Any) -> None:
+    """Check an op that no compiled call reaches, and that has no fake kernel therefore."""
+    torch.library.opcheck(op, arguments, test_utils=("test_schema", "test_autograd_registration"))
+
+
 def relative_error(actual: Tensor, expected: Tensor) -> float:
     """Return max |actual - expected| / max |expected|; infinite for NaN or anything else not finite."""
     assert actual.shape == expected.shape, f"shapes differ: {list(actual.shape)}, {list(expected.shape)}"
@@ -325,16 +329,20 @@ def read_glb(path):
 
 
 def parameter_gradients(
-    table: GaussianTable, frame: Frame, v_renders: Tensor, *weights: Tensor | None
+    table: GaussianTable,
+    frame: Frame,
+    v_renders: Tensor,
+    scale_reg: Tensor | None = None,
+    opacity_reg: Tensor | None = None,
 ) -> list[Tensor]:
     """Return the gradients of the U visible Gaussians' parameters, from those of a frame's images.
 
-    Training never stores them. `weights`: of regularisers, as those of `WeightedViews`.
+    Training never stores them. The weights are those of `project_bwd_step_`.
     """
     gradients, projected = backward_splats(frame, v_renders), frame.projected
     options = frame.options.projection(frame.views)
     *parameters, _ = torch.ops.blitzgs.project_bwd(
-        list(table.parameters), *WeightedViews(frame.views.viewmats, frame.views.Ks, *weights),
+        list(table.parameters), frame.views.viewmats, frame.views.Ks, scale_reg, opacity_reg,
         projected.camera_ids, projected.visible_ids, projected.splat_offsets, None, *options,
         list(gradients.parts), None, False,
     )  # fmt: skip

@@ -66,17 +66,22 @@ class Scene(NamedTuple):
     colors: Tensor | None  # SH [N, K, 3] or [C, N, K, 3], values [N, D] or [C, N, D]; None: depth alone
     viewmats: Tensor  # [C, 4, 4]
     Ks: Tensor  # [C, 3, 3]
-    # Covariances given instead of quats and scales; quats and scales then are their decomposition.
-    covariances: Decomposed | None = None
+    covariances: Decomposed | None = None  # given instead of quats and scales, which are of them then
     lenses: Lenses | None = None  # lenses and shutters of the views; None: pinhole cameras
+
+
+# The tensors of a scene: the first dimension, and the others.
+_SHAPES = (
+    ("means", "N", (3,)), ("quats", "N", (4,)), ("scales", "N", (3,)), ("opacities", "N", ()),
+    ("viewmats", "C", (4, 4)), ("Ks", "C", (3, 3)),
+)  # fmt: skip
 
 
 class Gaussians(NamedTuple):
     """The checked arguments of a call: S scenes of N Gaussians and C views each, I = S C images."""
 
     function: str  # name of the public function, for warnings
-    # The scenes, S >= 1. Without batch dimensions it has the caller's own tensors, so that a leaf stays a
-    # leaf.
+    # S >= 1. Without batch dimensions, these are the caller's own tensors: a leaf stays a leaf.
     scenes: tuple[Scene, ...]
     colors: Tensor | None  # colours of all scenes, as given by the caller
     opacities: Tensor  # opacities of all scenes, as given by the caller
@@ -84,8 +89,7 @@ class Gaussians(NamedTuple):
     per_view: bool  # whether every view has its own colours
     lead: tuple[int, ...]  # the batch dimensions, and C
     raw: bool  # whether scales and opacities are before their activation
-    # The arguments of the call that have to be finite, a tensor for each scene.
-    named: Mapping[str, tuple[Tensor, ...]]
+    named: Mapping[str, tuple[Tensor, ...]]  # the arguments that have to be finite, one for each scene
     signals: Signals | None = None  # the extra signals; None: none
 
     @property
@@ -107,10 +111,9 @@ class Gaussians(NamedTuple):
 def check_further(
     function: str, further: Mapping[str, Any], defaults: Mapping[str, Any] = GSPLAT_DEFAULTS
 ) -> None:
-    """Check further keyword arguments: only gsplat's names with gsplat's default values are accepted.
+    """Check further keyword arguments: only the names of `defaults` with their values are accepted.
 
-    `function`: name of the public function. `defaults`: the names and the only values that the function
-    takes. TypeError: gsplat has no such argument. ValueError: the value is not gsplat's default.
+    TypeError: gsplat has no such argument. ValueError: the value is not gsplat's default.
     """
     for name, value in further.items():
         if name not in defaults:
@@ -132,17 +135,12 @@ def checked_options(
     far_plane: float,
     radius_clip: float,
     eps2d: float,
-    sh_degree: int | None,
-    tile_size: int | None,
+    sh_degree: int | None,  # None: 0
+    tile_size: int | None,  # None: 16
     rasterize_mode: str,
-    raw: bool = False,
+    raw: bool = False,  # whether scales and opacities are before their activation
 ) -> ProjectionOptions:
-    """Check the arguments that are not tensors and return the projection's options.
-
-    `sh_degree`: None: 0. `tile_size`: None: 16. `raw`: whether scales and opacities are before their
-    activation. TypeError: a size or the degree is not a whole number, or another option not a number.
-    ValueError: one is out of range or has an unknown value.
-    """
+    """Check the arguments that are not tensors (TypeError, ValueError); return the projection's options."""
     tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
     degree = 0 if sh_degree is None else sh_degree
     whole = {"width": width, "height": height, "tile_size": tile_size, "sh_degree": degree}
@@ -188,12 +186,11 @@ def refuse_func_transforms() -> None:
 
 
 def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]) -> None:
-    """Check that arguments are tensors on one device, all float32 or all float64.
+    """Check that arguments are tensors on one device, all float32 or all float64; optional ones may be None.
 
-    `optional`: further arguments by name, which may be None. RuntimeError: the call is inside a transform of
-    `torch.func`. TypeError: an argument is not a tensor, but for example an array of another library, or has
-    a dtype that the kernels do not compute in. ValueError: an argument has another dtype, or is on another
-    device, whose memory the kernels could not read.
+    RuntimeError: the call is inside a transform of `torch.func`. TypeError: an argument is no tensor, but
+    perhaps an array of another library, or has a dtype that the kernels lack. ValueError: dtypes or devices
+    differ.
     """
     refuse_func_transforms()
     device, dtype, first = None, None, ""
@@ -213,24 +210,14 @@ def check_tensors(required: Mapping[str, object], optional: Mapping[str, object]
 
 
 def gaussians_of(
-    function: str,
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor | None,
-    viewmats: Tensor,
-    Ks: Tensor,
+    function: str,  # name of the public function
+    whole: Scene,  # its arguments, with all batch dimensions
     sh_degree: int | None,
-    render_mode: str,
-    raw: bool = False,
+    render_mode: str,  # without "RGB", colours are not rendered
+    raw: bool = False,  # whether scales and opacities are before their activation
 ) -> Gaussians:
-    """Check shapes and fold the batch dimensions into one (ValueError: a shape that does not fit, by name).
-
-    The arguments are those of `blitzgs.rasterization`, but for the name of the public `function`; and `raw`,
-    whether scales and opacities are before their activation. Without "RGB" in `render_mode`, colours are not
-    rendered.
-    """
+    """Check shapes and fold the batch dimensions into one (ValueError: a wrong shape, by name)."""
+    means, _, _, opacities, colors, viewmats, Ks, *_ = whole
     if Ks.requires_grad and torch.is_grad_enabled() and not torch.compiler.is_compiling():
         warn_of_gradient(function)
     if means.dim() < 2 or viewmats.dim() < 3:
@@ -239,16 +226,10 @@ def gaussians_of(
             f"{list(viewmats.shape)}"
         )
     batch, N, C = tuple(means.shape[:-2]), means.shape[-2], viewmats.shape[-3]
-    for name, tensor, last, described in (
-        ("means", means, (N, 3), "N, 3"),
-        ("quats", quats, (N, 4), "N, 4"),
-        ("scales", scales, (N, 3), "N, 3"),
-        ("opacities", opacities, (N,), "N"),  # another shape might broadcast
-        ("viewmats", viewmats, (C, 4, 4), "C, 4, 4"),
-        ("Ks", Ks, (C, 3, 3), "C, 3, 3"),
-    ):
-        if tensor.shape != (*batch, *last):
-            refuse_shape(name, tensor, (*batch, *last), described)
+    for name, first, last in _SHAPES:  # another shape might broadcast
+        tensor, shape = getattr(whole, name), (*batch, N if first == "N" else C, *last)
+        if tensor.shape != shape:
+            refuse_shape(name, tensor, shape, ", ".join(map(str, (first, *last))))
     with_colors = "RGB" in render_mode
     if colors is None and with_colors:
         raise ValueError("colors may be None for the render modes D and ED alone")
@@ -267,7 +248,7 @@ def gaussians_of(
     ):
         colors = colors_of_views(degree, means, viewmats, colors, per_view)
         per_view, degree = True, None
-    whole = Scene(means, quats, scales, opacities, colors, viewmats, Ks)
+    whole = whole._replace(colors=colors)
     scenes = _scenes(whole, batch) if batch else (whole,)
     columns = zip(Scene._fields, zip(*scenes, strict=True), strict=True)
     named = {name: own for name, own in columns if own[0] is not None}

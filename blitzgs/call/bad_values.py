@@ -26,11 +26,9 @@ _LEAST_SKEW = 1e-6
 
 
 def check_intrinsics(Ks: Sequence[Tensor]) -> None:
-    """Refuse intrinsics that the pinhole projection does not have; waits for the device.
+    """Refuse intrinsics [C, 3, 3] of scenes with a skew, or another last row than 0, 0, 1 (ValueError).
 
-    The projection renders nothing with them, so that calls look only where a view shows nothing.
-
-    `Ks`: [C, 3, 3] of each scene. ValueError: a matrix has a skew, or another last row than 0, 0, 1.
+    The projection renders nothing with them, so calls look only where a view shows nothing: the host waits.
     """
     _check_rows(np.concatenate([to_host(matrices.detach()).numpy().reshape(-1, 9) for matrices in Ks]))
 
@@ -66,9 +64,8 @@ class CamerasOnHost:
         return bool(np.isfinite(values).all())
 
 
-# On CUDA, the first of this many calls of a size checks all arguments: the check is a pass over all
-# Gaussians, and their values that are not finite stay so. Cameras differ from call to call, so every call
-# looks for bad ones.
+# On CUDA, the first of this many calls of a size checks all arguments, in a pass over all Gaussians. Cameras
+# differ from call to call, so every call looks for bad ones.
 EVERY_CUDA_CALLS = 32
 COLOURS = ("colors", "sh0", "shN")
 SIGNALS = "extra_signals"
@@ -78,10 +75,8 @@ SIGNALS = "extra_signals"
 def non_finite(gaussians: Gaussians) -> dict[str, Tensor]:
     """Return, by argument, the indices int64 [M] of Gaussians or views whose values are not finite.
 
-    Indices count through all scenes of a batch. Arguments whose values are all finite have no entry.
-
-    One sum over each argument tells whether its rows have to be looked at, so finite arguments are read once
-    and need no memory of their size.
+    Indices count through all scenes of a batch. Arguments whose values are all finite have no entry: one sum
+    over each tells whether its rows have to be looked at, which needs no memory of their size.
     """
     activated = {
         name: [_activated(t, name, gaussians.raw) for t in tensors]
@@ -142,10 +137,8 @@ def watch_for_non_finite(
     """Warn about arguments of a renderer with values that are not finite, after a cheap check for any.
 
     On CUDA most calls check the cameras alone, see `EVERY_CUDA_CALLS`. SH coefficients, the largest part of a
-    Gaussian, are only checked for visible Gaussians.
-
-    `nan_marks`: a value for each Gaussian, NaN if its colours are values that are not finite, or its extra
-    signals are not.
+    Gaussian, are only checked for visible Gaussians. `nan_marks`: for each Gaussian, NaN if its colours (if
+    they are values) or its extra signals are not finite.
     """
     named = gaussians.named
     first = named["means"][0]

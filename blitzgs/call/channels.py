@@ -31,11 +31,7 @@ class ImageOptions(NamedTuple):
 def background_rows(
     backgrounds: Tensor | None, gaussians: Gaussians, render_mode: str, normals: bool = False
 ) -> Tensor | None:
-    """Return the background of each image, [I, channels], from `backgrounds`, [..., C, D] or [..., C, D + E].
-
-    `backgrounds`: of the colours and, as in gsplat, of the E extra signals if there are any. ValueError: the
-    shape does not fit.
-    """
+    """Return the background of each image, [I, channels], from [..., C, D] or [..., C, D + E]."""
     if backgrounds is None or "RGB" not in render_mode:
         return None
     assert gaussians.colors is not None
@@ -92,11 +88,7 @@ def split_channels(
 
 
 def _signals(splats: ProjectedSplats, gaussians: Gaussians, with_spare: bool) -> Tensor:
-    """Return the extra signals of P splats, [P, E].
-
-    SH are evaluated as colours are, along the direction from the camera centre, but not clamped:
-    sum of Y_k(direction) c_k, plus 0.5. Differentiable in the signals and, for SH, in means and viewmats.
-    """
+    """Return the extra signals of P splats, [P, E]; SH are evaluated as for colours, but not clamped."""
     signals = gaussians.signals
     assert signals is not None
     rows = _rows(splats, gaussians, signals.per_view, with_spare)

@@ -6,12 +6,10 @@ The functions about pixels have gsplat's names and results.
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from blitzgs.call.arguments import check_tensors, checked_options, gaussians_of
+from blitzgs.call.arguments import Scene, check_tensors, checked_options, gaussians_of
 from blitzgs.call.bad_values import check_intrinsics, warn_of_non_finite
 from blitzgs.call.extras import checked_pixels
 from blitzgs.ops.importance import UNITS, PixelSplats, pixel_splats
@@ -54,36 +52,24 @@ def contributions(
         scales: [N, 3] standard deviations (after the exponential).
         opacities: [N] in [0, 1] (after the sigmoid).
         viewmats: [C, 4, 4] world to camera, a rotation and a translation; any number of views.
-        Ks: [C, 3, 3] intrinsics in px, without skew and with a last row 0, 0, 1.
-        width: of every view, px.
-        height: of every view, px.
-        near_plane: Gaussians have z > near_plane, world units.
-        far_plane: Gaussians have z <= far_plane, world units.
-        eps2d: variance added to both screen axes, px^2.
-        rasterize_mode: "classic" or "antialiased".
+        Ks: [C, 3, 3] intrinsics in px.
+        width, height, near_plane, far_plane, eps2d, rasterize_mode: as in `blitzgs.rasterization`.
 
     Returns:
         weights float64 [C, N]; pixels int64 [C, N]; visible bool [C, N]: in depth range, and the box around
         its alpha >= 1/255 overlaps the image (gsplat's radii > 0). A Gaussian may be visible in this sense
         and contribute to no pixel.
 
-    Warns:
-        RuntimeWarning: an argument has values that are NaN or infinite; the Gaussians or views that have them
-            contribute nothing.
-
-    Raises:
-        TypeError: an argument is not a tensor, or not the kind of number it should be; or the tensors are
-            neither float32 nor float64.
-        ValueError: an argument has a wrong shape or value, or another dtype or device than the others; the
-            message names it.
-        RuntimeError: float64 tensors are on a GPU, or the call is inside a transform of `torch.func`.
+    Warns, raises:
+        As `blitzgs.rasterization`; all arguments are looked at for values that are not finite.
     """
     options = checked_options(width, height, near_plane, far_plane, 0.0, eps2d, None, None, rasterize_mode)
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks}, {})
     if means.dim() != 2:
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
-    gaussians = gaussians_of("contributions", means, quats, scales, opacities, None, viewmats, Ks, None, "D")
+    scene = Scene(means, quats, scales, opacities, None, viewmats, Ks)
+    gaussians = gaussians_of("contributions", scene, None, "D")
     warn_of_non_finite(gaussians)
     check_intrinsics([Ks])
     shape = (len(viewmats), len(means))
@@ -130,9 +116,7 @@ def rasterize_num_contributing_gaussians(
         opacities: [nnz] or [..., N], `meta["opacities"]`.
         tile_offsets: `meta["isect_offsets"]`, [..., tile_height, tile_width].
         flatten_ids: `meta["flatten_ids"]`, [n_isects].
-        image_width: px.
-        image_height: px.
-        tile_size: `meta["tile_size"]`, px; 16 on CUDA.
+        image_width, image_height, tile_size: entries of `meta`, px; tiles are of 16 px on CUDA.
         pixels: [M, 2] (row, column) of the pixels to return; None: all.
         image_ids: [M], the image of each pixel; None: there is one image.
 
@@ -144,10 +128,11 @@ def rasterize_num_contributing_gaussians(
         ValueError: a shape does not fit, or a pixel is outside the images.
         RuntimeError: the tile size is not 16 on CUDA, or on the CPU, the entries are of several calls.
     """
-    found, lead = _splats_of_pixels(
-        means2d, conics, opacities, tile_offsets, flatten_ids, image_width, image_height, tile_size, 0,
-        pixels, image_ids,
-    )  # fmt: skip
+    entries, grid = (
+        (means2d, conics, opacities, tile_offsets, flatten_ids),
+        (image_width, image_height, tile_size),
+    )
+    found, lead = _splats_of_pixels(entries, grid, 0, pixels, image_ids)
     return found.counts.reshape(lead), (1 - found.transmittances).reshape(lead)
 
 
@@ -205,10 +190,11 @@ def rasterize_top_contributing_gaussian_ids(
     Returns:
         Ids and weights, as `rasterize_contributing_gaussian_ids` returns them.
     """
-    found, lead = _splats_of_pixels(
-        means2d, conics, opacities, tile_offsets, flatten_ids, image_width, image_height, tile_size,
-        num_depth_samples, pixels, image_ids,
-    )  # fmt: skip
+    entries, grid = (
+        (means2d, conics, opacities, tile_offsets, flatten_ids),
+        (image_width, image_height, tile_size),
+    )
+    found, lead = _splats_of_pixels(entries, grid, num_depth_samples, pixels, image_ids)
     ids = found.ids
     if means2d.dim() > 2:
         ids = torch.where(ids < 0, ids, ids % max(means2d.shape[-2], 1))
@@ -216,19 +202,15 @@ def rasterize_top_contributing_gaussian_ids(
 
 
 def _splats_of_pixels(
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    tile_offsets: Tensor,
-    flatten_ids: Tensor,
-    width: int,
-    height: int,
-    tile_size: int,
+    entries: tuple[Tensor, ...],  # means2d, conics, opacities, tile_offsets, flatten_ids
+    grid: tuple[int, int, int],  # image_width, image_height, tile_size
     strongest: int,
     pixels: Tensor | None,
     image_ids: Tensor | None,
 ) -> tuple[PixelSplats, tuple[int, ...]]:
     """Check the arguments; return the splats of the pixels and the leading shape of the results."""
+    means2d, conics, opacities, tile_offsets, flatten_ids = entries
+    width, height, tile_size = grid
     check_tensors({"means2d": means2d, "conics": conics, "opacities": opacities}, {})
     for name, integers in (("tile_offsets", tile_offsets), ("flatten_ids", flatten_ids)):
         if not isinstance(integers, Tensor) or integers.is_floating_point():
@@ -249,6 +231,8 @@ def _splats_of_pixels(
     end = torch.full((1,), len(flatten_ids), dtype=torch.int64, device=tile_offsets.device)
     geometry = means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.reshape(-1)
     lists = flatten_ids.int(), torch.cat([tile_offsets.reshape(-1).long(), end])
-    grid: dict[str, Any] = {"n_cameras": images, "width": width, "height": height, "tile_size": tile_size}
-    found = pixel_splats(*geometry, *lists, **grid, strongest=strongest, pixels=numbers)
+    found = pixel_splats(
+        *geometry, *lists, n_cameras=images, width=width, height=height, tile_size=tile_size,
+        strongest=strongest, pixels=numbers,
+    )  # fmt: skip
     return found, (*lead, height, width) if numbers is None else (len(numbers),)

@@ -73,9 +73,8 @@ def _principal_axes(matrices: Tensor) -> tuple[Tensor, Tensor]:
 def shaped_by(splats: ProjectedSplats, inputs: ProjectionInputs, decomposed: Decomposed) -> ProjectedSplats:
     """Return splats whose conics, and compensated opacities, come from covariances (docs/image.md).
 
-    In double, because the determinant of a covariance loses the digits of a thin splat.
-
-    `splats`: of the decomposed covariances.
+    In double, because the determinant of a covariance loses the digits of a thin splat. `splats`: of the
+    decomposed covariances.
     """
     means, _, _, opacities, *_ = inputs.gaussians
     means, opacities, viewmats, Ks = (t.double() for t in (means, opacities, *inputs.cameras))

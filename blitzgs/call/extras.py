@@ -27,11 +27,7 @@ _UT_PARAMS = ("alpha", "beta", "kappa", "in_image_margin_factor", "require_all_s
 
 
 def with_signals(gaussians: Gaussians, values: Tensor, sh_degree: int | None) -> Gaussians:
-    """Return Gaussians with extra signals.
-
-    `values`: `extra_signals` of `blitzgs.rasterization`. `sh_degree`: its `extra_signals_sh_degree`.
-    ValueError: a shape, the degree or the number of channels does not fit.
-    """
+    """Return Gaussians with extra signals (ValueError: a shape, degree or width does not fit)."""
     batch, views, count = gaussians.lead[:-1], gaussians.views, gaussians.n_gaussians
     shape, per_view = tuple(values.shape), False
     most = MAX_CHANNELS - NORMAL_CHANNELS - 1
@@ -64,11 +60,7 @@ def with_signals(gaussians: Gaussians, values: Tensor, sh_degree: int | None) ->
 def with_covariances(
     gaussians: Gaussians, covars: Tensor, sparse_grad: bool, return_normals: bool
 ) -> Gaussians:
-    """Return Gaussians whose quats and scales are those of covariances.
-
-    `gaussians`: with any quats and scales. `covars` and the switches: as for `blitzgs.rasterization`.
-    ValueError: the shape does not fit, or a switch is on.
-    """
+    """Return Gaussians with axes of covariances (ValueError: wrong shape, or a switch is on)."""
     if sparse_grad:
         raise ValueError("sparse_grad does not support covars; leave one of them out")
     if return_normals:
@@ -87,10 +79,7 @@ def with_covariances(
 
 
 def check_without_ut(camera_model: str, rolling_shutter: Any, others: Mapping[str, object]) -> None:
-    """Check a call without with_ut: it has none of the arguments that need it.
-
-    ValueError: it has one, by name.
-    """
+    """Refuse arguments that need `with_ut` in a call without it (ValueError: the first one, by name)."""
     given = [name for name, value in others.items() if value is not None]
     given += ["rolling_shutter"] if _shutter(rolling_shutter) != GLOBAL_SHUTTER else []
     given += [f"camera_model={camera_model!r}"] if camera_model != "pinhole" else []
@@ -103,16 +92,12 @@ def with_lenses(
     camera_model: str,
     rolling_shutter: Any,
     ut_params: Any,
-    refused: Mapping[str, bool],
-    radial_coeffs: Tensor | None,
-    tangential_coeffs: Tensor | None,
-    thin_prism_coeffs: Tensor | None,
-    viewmats_rs: Tensor | None,
+    refused: Mapping[str, bool],  # unsupported arguments, by what to call them: are they given?
+    lens: Mapping[str, Tensor | None],  # radial_coeffs to viewmats_rs
 ) -> Gaussians:
     """Return Gaussians whose scenes have lenses; the arguments are those of `blitzgs.rasterization`.
 
-    `refused`: whether arguments that the unscented projection does not support are given, by what to call
-    them. ValueError: one is, a shape or value is wrong, or two arguments do not go together.
+    ValueError: one is, a shape or value is wrong, or two arguments do not go together.
     """
     lead, first = gaussians.lead, gaussians.scenes[0].viewmats
     compiled = {"torch.compile": torch.compiler.is_compiling()}
@@ -122,13 +107,11 @@ def with_lenses(
             raise ValueError(f"with_ut does not support {name}; leave one of them out")
     fisheye = camera_model == "fisheye"
     given: dict[str, Tensor] = {}
-    for name, tensor, last in (
-        ("radial_coeffs", radial_coeffs, (4,) if fisheye else (6,)),
-        ("tangential_coeffs", tangential_coeffs, (2,)),
-        ("thin_prism_coeffs", thin_prism_coeffs, (4,)),
-        ("viewmats_rs", viewmats_rs, (4, 4)),
-    ):
-        if tensor is None:
+    for name, last in (
+        ("radial_coeffs", (4,) if fisheye else (6,)), ("tangential_coeffs", (2,)),
+        ("thin_prism_coeffs", (4,)), ("viewmats_rs", (4, 4)),
+    ):  # fmt: skip
+        if (tensor := lens[name]) is None:
             continue
         if tensor.shape != (*lead, *last):
             refuse_shape(name, tensor, (*lead, *last), ", ".join(map(str, ("C", *last))))
@@ -136,14 +119,14 @@ def with_lenses(
             raise ValueError(f"a fisheye has no {name}; leave it out")
         given[name] = tensor.detach().reshape(gaussians.images, *last)
     shutter = _shutter(rolling_shutter)
-    if (shutter == GLOBAL_SHUTTER) != (viewmats_rs is None):
+    if (shutter == GLOBAL_SHUTTER) != ("viewmats_rs" not in given):
         raise ValueError("a rolling shutter needs viewmats_rs, and a global one has none")
     lenses = first.new_zeros(gaussians.images, 13)
     lenses[:, 12] = math.inf
     for name, begin in (("radial_coeffs", 0), ("tangential_coeffs", 6), ("thin_prism_coeffs", 8)):
         if name in given:
             lenses[:, begin : begin + given[name].shape[1]] = given[name]
-    if fisheye and radial_coeffs is not None:
+    if fisheye and "radial_coeffs" in given:
         lenses[:, 12] = largest_angles(given["radial_coeffs"])
     whole = Lenses(lenses, given.get("viewmats_rs"), fisheye, shutter)
     if ut_params is not None:
@@ -176,11 +159,10 @@ class Pixels(NamedTuple):
 def checked_pixels(
     pixels: Tensor | None, image_ids: Tensor | None, images: int, width: int, height: int
 ) -> Pixels | None:
-    """Check a list of pixels; None: there is none.
+    """Check `pixels` and `image_ids` of `blitzgs.rasterization`; None: there are none.
 
-    `pixels`: integers [M, 2], (row, column). `image_ids`: integers [M], the image of each pixel, counted
-    through all batch dimensions; None: 0. TypeError: they are not tensors of integers. ValueError: a shape
-    does not fit, a pixel is outside the images, or there are several images and no `image_ids`.
+    TypeError: they are not tensors of integers. ValueError: a shape does not fit, a pixel is outside the
+    images, or there are several images and no `image_ids`.
     """
     if pixels is None:
         if image_ids is not None:

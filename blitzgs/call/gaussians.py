@@ -32,8 +32,7 @@ def quat_scale_to_covar_preci(
     Args:
         quats: [..., 4] (w, x, y, z), floating point, of any length but zero.
         scales: [..., 3] standard deviations, in world units.
-        compute_covar: whether the covariances are wanted.
-        compute_preci: whether the inverses are wanted; of a scale of 0, they are not finite.
+        compute_covar, compute_preci: whether covariances and inverses (infinite for scales of 0) are wanted.
         triu: whether to return (xx, xy, xz, yy, yz, zz), [..., 6].
 
     Returns:
@@ -118,8 +117,7 @@ def position_noise(
         scales: [N, 3], logarithms.
         opacities: [N] or [N, 1], logits.
         scaler: inverse length; gsplat's MCMCStrategy passes the learning rate of the means times 5e5.
-        seed: seed of the run, 0 to 2^63 - 1.
-        step: each step draws other numbers.
+        seed, step: of the run, 0 to 2^63 - 1; each step draws other numbers.
         threshold: opacity at which the noise falls to a half.
 
     Returns:
@@ -325,10 +323,9 @@ class _L1Ssim(torch.autograd.Function):
 def _constants(
     views: int, count: int, weight: float, dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what the loss of views without a mask needs; each tensor would cost a launch in every step.
+    """Return weights of the sums of L1 and SSIM, and their divisors, [B] each, for views without a mask.
 
-    `views`: number of views B. `count`: values that the mean of a view averages, at least 1. Returns the
-    weights of the sums of L1 and SSIM and their divisors, [B] each.
+    Each of these tensors would cost a launch in every step. `count`: values that the mean of a view averages.
     """
     values = ((1 - weight) / views, -weight / views, count)
     l1, ssim, divisors = (torch.full((views,), value, dtype=dtype, device=device) for value in values)

@@ -30,12 +30,10 @@ CUDA_TILE_SIZE = 16
 class Places(NamedTuple):
     """Where P splats are in an arrangement."""
 
-    # (order,), int64 [P]: entry i is splat order[i], and each splat has one entry; or (images, gaussians),
-    # int32 [P] each: a splat is the entry [image, Gaussian] of an arrangement of all Gaussians in all images,
-    # and no two splats have the same entry.
+    # (order,), int64 [P]: entry i is splat order[i], each splat once; or (images, gaussians), int32 [P] each:
+    # each splat has its own entry [image, Gaussian] of an arrangement of all Gaussians in all images.
     indices: tuple[Tensor, ...]
-    # Dimensions of the arrangement, [P] or [..., C, N], where the images are counted through [..., C].
-    shape: tuple[int, ...]
+    shape: tuple[int, ...]  # of the arrangement: [P], or [..., C, N] with images counted by [..., C]
 
     def flat(self) -> Tensor:
         """Return the place of each splat in the flat arrangement, int64 [P]."""
@@ -46,51 +44,47 @@ class Places(NamedTuple):
         return images.long() * self.shape[-1] + gaussians
 
     def arrange(self, columns: Sequence[Tensor], under: Tensor | None = None) -> tuple[Tensor, ...]:
-        """Arrange columns of splats.
+        """Arrange columns of splats, [P, ...] with elements of 4 or 8 bytes; return [*shape, ...] of each.
 
-        `columns`: [P, ...] each, with elements of 4 or 8 bytes. `under`: values of the Gaussians, [..., N],
-        that entries of the last column have if they have no splat; None: zeros, as in the other columns.
-        Returns the columns, [*shape, ...].
+        `under`: values of the Gaussians, [..., N], that entries of the last column have if they have no
+        splat; None: zeros, as in the other columns.
         """
         if torch.compiler.is_compiling():  # torch differentiates them, and tracing a Function is fragile
             return self._arranged_by_torch(columns, under)
-        if not torch.is_grad_enabled():
+
+        def run(under: Tensor | None, *columns: Tensor) -> tuple[Tensor, ...]:
             return tuple(torch.ops.blitzgs.arrange_splats(columns, self.indices, self.shape, under))
-        shape = self.shape
-        return linear_map(
-            lambda under, *columns: tuple(
-                torch.ops.blitzgs.arrange_splats(columns, self.indices, shape, under)
-            ),
-            lambda saved, needed, v: _gradients_of_arranged(Places(tuple(saved), shape), needed, v),
-            [under, *columns],
-            self.indices,
-        )
+
+        def back(needed: Sequence[bool], v: Sequence[Tensor | None]) -> list[Tensor | None]:
+            v_columns, v_under = _given(self.gather, v), None
+            v_last, v_of_splats = v[-1], v_columns[-1]
+            if needed[0] and v_last is not None and v_of_splats is not None:
+                # No two splats have the same place.
+                v_under = (v_last - self.arrange([v_of_splats])[0]).sum(dim=-2)
+            return [v_under, *v_columns]
+
+        return linear_map(run, back, [under, *columns]) if torch.is_grad_enabled() else run(under, *columns)
 
     def gather(self, arranged: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Return the columns of the splats, [P, ...], of arranged ones, [*shape, ...]."""
         if torch.compiler.is_compiling():
             places, first = self.flat(), len(self.shape)
             return tuple(t.reshape(-1, *t.shape[first:]).index_select(0, places) for t in arranged)
-        if not torch.is_grad_enabled():
+
+        def run(*arranged: Tensor) -> tuple[Tensor, ...]:
             return tuple(torch.ops.blitzgs.splats_of_arranged(arranged, self.indices, self.shape))
-        shape = self.shape
-        return linear_map(
-            lambda *arranged: tuple(torch.ops.blitzgs.splats_of_arranged(arranged, self.indices, shape)),
-            lambda saved, _, v: _given(Places(tuple(saved), shape).arrange, v),
-            arranged,
-            self.indices,
-        )
+
+        if not torch.is_grad_enabled():
+            return run(*arranged)
+        return linear_map(run, lambda _, v: _given(self.arrange, v), arranged)
 
     def _arranged_by_torch(self, columns: Sequence[Tensor], under: Tensor | None) -> tuple[Tensor, ...]:
-        places, found = self.flat(), []
-        for i, column in enumerate(columns):
-            over = under is not None and i == len(columns) - 1
-            arranged = column.new_zeros(*self.shape, *column.shape[1:])
-            if over:
-                assert under is not None
-                arranged = under[..., None, :].expand(self.shape).clone(memory_format=torch.contiguous_format)
+        places = self.flat()
+        found = [column.new_zeros(*self.shape, *column.shape[1:]) for column in columns]
+        if under is not None:
+            found[-1] = under[..., None, :].expand(self.shape).clone(memory_format=torch.contiguous_format)
+        for arranged, column in zip(found, columns, strict=True):
             arranged.view(-1, *column.shape[1:]).index_copy_(0, places, column)
-            found.append(arranged)
         return tuple(found)
 
 
@@ -103,17 +97,6 @@ def _given(
     return [None if column is None else next(found) for column in columns]
 
 
-def _gradients_of_arranged(
-    places: Places, needed: Sequence[bool], v_arranged: Sequence[Tensor | None]
-) -> list[Tensor | None]:
-    """Return the gradients of `under` and of the columns; no two splats have the same place."""
-    v_under, v_columns = None, _given(places.gather, v_arranged)
-    v_last, v_of_splats = v_arranged[-1], v_columns[-1]
-    if needed[0] and v_last is not None and v_of_splats is not None:
-        v_under = (v_last - places.arrange([v_of_splats])[0]).sum(dim=-2)
-    return [v_under, *v_columns]
-
-
 class Layout:
     """The arrangement of P splats in `meta`: the visible ones if `packed`, or else all of all views.
 
@@ -121,14 +104,13 @@ class Layout:
     """
 
     def __init__(
-        self, splats: ProjectedSplats, shape: tuple[int, ...], packed: bool, under: Tensor | None
+        self,
+        splats: ProjectedSplats,  # camera_ids number all images, gaussian_ids the Gaussians of a scene
+        shape: tuple[int, ...],  # batch dimensions, C, and the Gaussians N of a scene
+        packed: bool,
+        under: Tensor | None,  # opacities of Gaussians without a splat, [..., N]; None: zero
     ) -> None:
-        """Compute the arrangement.
-
-        `splats`: their camera_ids number all images of the call, their gaussian_ids the Gaussians of a scene.
-        `shape`: batch dimensions, C, and the Gaussians N of a scene. `under`: opacities of the Gaussians,
-        [..., N], where they have no splat; None: zero.
-        """
+        """Compute the arrangement."""
         self.splats, self.packed = splats, packed
         self.places: Places | None = None  # of each splat in `meta`; None: the order is unchanged
         if not packed:
@@ -198,9 +180,9 @@ def lists_of(
 ) -> tuple[Lists, Lists]:
     """Return the tile lists for meta, and those to composite.
 
-    `count`: number of entries of the lists for meta; -1: unknown. `pixels`: the pixels that are rendered: the
-    lists of tiles without any are empty, and those of the others are as in the whole image, so that these
-    pixels have the same bits. None: all.
+    `count`: number of entries of the lists for meta; -1: unknown. `pixels`: the pixels that are rendered;
+    lists of tiles without any are empty, and others are those of the whole image, so that these pixels have
+    the same bits. None: all.
     """
 
     def listed_by(edge: int, n_isects: int) -> Lists:

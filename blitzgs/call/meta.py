@@ -29,18 +29,10 @@ _NOTHING_KNOWN = dict.fromkeys((*_KEYS, "non_finite"), LATER)
 
 
 class LazyDict(dict[str, Any]):
-    """A dict with values that are computed when they are first read.
-
-    In every other way it is a dict: readers find values only, copies and pickles are plain dicts, and any
-    value may be replaced or deleted.
-    """
+    """A dict with values that are computed when they are first read; copies and pickles are plain dicts."""
 
     def __init__(self, given: Mapping[str, Any], compute: Callable[[str], Any]) -> None:
-        """Begin with some values.
-
-        `given`: the values by key; `LATER` where they are not known. `compute`: returns the value of such a
-        key.
-        """
+        """Begin with values by key; `LATER` for one that `compute` returns, given the key."""
         super().__init__(given)
         self._compute = compute
 
@@ -59,6 +51,8 @@ class LazyDict(dict[str, Any]):
     setdefault = MutableMapping.setdefault
     values = Mapping.values  # type: ignore[assignment]
     items = Mapping.items  # type: ignore[assignment]
+    __eq__ = Mapping.__eq__
+    __ne__ = object.__ne__  # the inverse of `__eq__`
 
     def pop(self, key: str, *default: Any) -> Any:
         """Remove a key and return its value, or `default`."""
@@ -73,12 +67,6 @@ class LazyDict(dict[str, Any]):
     def copy(self) -> dict[str, Any]:
         """Return a plain dict of the same values."""
         return dict(self)
-
-    def __eq__(self, other: object) -> bool:
-        return dict(self) == other
-
-    def __ne__(self, other: object) -> bool:
-        return dict(self) != other
 
     def __or__(self, other: Any) -> Any:
         return dict(self) | other
@@ -127,18 +115,14 @@ for _class in (LazyDict, LateMapping):
 def make_meta(
     gaussians: Gaussians,
     layout: Layout,
-    others: Mapping[str, Tensor],
+    others: Mapping[str, Tensor],  # further images by key
     lists: Lists,
-    lead: tuple[int, ...],
-    arrived: ProjectedSplats | None,
+    lead: tuple[int, ...],  # batch dimensions, and the number of views that are rendered here
+    arrived: ProjectedSplats | None,  # the splats of `lists`, if ranks exchanged some
 ) -> dict[str, Any]:
     """Return `meta`; entries that the image did not need are computed when they are first read.
 
     Under `torch.compile` it is a plain dict, and the compiler removes entries that the caller does not read.
-
-    `others`: further images by key. `lead`: batch dimensions, and the
-    number of views that are rendered here. `arrived`: the splats that `lists` refers to, if ranks have
-    exchanged splats; None: those of `layout`.
     """
     entries = _Entries(gaussians, layout, lists, lead, arrived)
     known = {
@@ -163,13 +147,10 @@ class _Entries(NamedTuple):
         return getattr(self, key)()
 
     def batch_ids(self) -> Tensor | None:
-        images = self.layout.splats.camera_ids.long()
-        single = len(self.gaussians.scenes) == 1
-        return self._of_packed(torch.zeros_like(images) if single else images // self.gaussians.views)
+        return self._of_packed(self.layout.splats.camera_ids.long() // self.gaussians.views)
 
     def camera_ids(self) -> Tensor | None:
-        images = self.layout.splats.camera_ids.long()
-        return self._of_packed(images if len(self.gaussians.scenes) == 1 else images % self.gaussians.views)
+        return self._of_packed(self.layout.splats.camera_ids.long() % self.gaussians.views)
 
     def gaussian_ids(self) -> Tensor | None:
         return self._of_packed(self.layout.splats.gaussian_ids.long())
@@ -190,8 +171,17 @@ class _Entries(NamedTuple):
         return self.lists.grid.tiles[1]
 
     def isect_ids(self) -> Tensor:
-        splats = self.layout.splats if self.arrived is None else self.arrived
-        return _isect_ids(splats.depths, self.lists)
+        """Return gsplat's sort keys, int64: image | tile | float32 depth bits, from high to low."""
+        splats, grid = self.layout.splats if self.arrived is None else self.arrived, self.lists.grid
+        depths = splats.depths.detach().index_select(0, self.lists.listed())
+        entries = torch.arange(len(depths), device=depths.device)
+        keys = torch.searchsorted(self.lists.offsets[1:], entries, right=True)
+        if grid.n_cameras > 1:
+            # The bits of n_tiles. Its `bit_length()` would compile a graph for every number of tiles.
+            n_tiles = math.prod(grid.tiles)
+            tiles = torch.full((), n_tiles, dtype=torch.float64, device=depths.device)
+            keys = (keys // n_tiles << torch.frexp(tiles).exponent) | keys % n_tiles
+        return keys.bitwise_left_shift(32).bitwise_or(depths.float().view(torch.int32))
 
     def flatten_ids(self) -> Tensor:
         listed, places = self.lists.listed(), self.layout.places
@@ -204,16 +194,3 @@ class _Entries(NamedTuple):
 
     def non_finite(self) -> LateMapping:
         return LateMapping(lambda: non_finite(self.gaussians))
-
-
-def _isect_ids(depths: Tensor, lists: Lists) -> Tensor:
-    """Return gsplat's sort keys, int64: image | tile | float32 depth bits, from high to low."""
-    depths = depths.detach().index_select(0, lists.listed())
-    entries = torch.arange(len(depths), device=depths.device)
-    keys = torch.searchsorted(lists.offsets[1:], entries, right=True)
-    n_tiles = math.prod(lists.grid.tiles)
-    if lists.grid.n_cameras > 1:
-        # The bits of n_tiles. Its `bit_length()` would compile a graph for every number of tiles.
-        tiles = torch.full((), n_tiles, dtype=torch.float64, device=depths.device)
-        keys = (keys // n_tiles << torch.frexp(tiles).exponent) | keys % n_tiles
-    return keys.bitwise_left_shift(32).bitwise_or(depths.float().view(torch.int32))

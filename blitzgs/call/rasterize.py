@@ -12,6 +12,7 @@ from blitzgs.call.arguments import (
     CAMERA_MODELS,
     DEFAULT_TILE_SIZE,
     RENDER_MODES,
+    Scene,
     check_choice,
     check_further,
     check_tensors,
@@ -20,8 +21,8 @@ from blitzgs.call.arguments import (
 )
 from blitzgs.call.channels import ImageOptions, background_rows
 from blitzgs.call.extras import check_without_ut, checked_pixels, with_covariances, with_lenses, with_signals
-from blitzgs.call.images import render
 from blitzgs.call.ranks import gather_views
+from blitzgs.call.render import render
 from blitzgs.util.errors import explain_memory
 
 # Colours of networks under autocast, and of SH tables in half precision.
@@ -95,10 +96,8 @@ def rasterization(
         viewmats: [..., C, 4, 4] world to camera, a rotation and a translation.
         Ks: [..., C, 3, 3] intrinsics in px, without skew and with a last row 0, 0, 1. They get no
             gradient. Others are refused; under `torch.compile` nothing is rendered with them.
-        width: image width in px.
-        height: image height in px.
-        near_plane: Gaussians have z > near_plane, world units; less than far_plane.
-        far_plane: Gaussians have z <= far_plane, world units.
+        width, height: size of the images in px.
+        near_plane, far_plane: Gaussians have near_plane < z <= far_plane, world units.
         radius_clip: drop splats whose radii in meta are both at most this, px, at least 0.
         eps2d: variance added to both screen axes, px^2, at least 0.
         sh_degree: degree to evaluate, 0 to 4; None when `colors` holds values.
@@ -117,14 +116,14 @@ def rasterization(
             absolute pixel gradients.
         rasterize_mode: "classic" or "antialiased". The factor on the opacity has no lower limit, as in gsplat
             1.5.3; gsplat's main branch limits it to 0.005, so that tiny Gaussians do not vanish.
-        channel_chunk: accepted and not needed: all channels are rendered in one pass.
+        channel_chunk, segmented: accepted and not needed: all channels are rendered in one pass, and gsplat's
+            sort never changes the result.
         distributed: whether Gaussians and views are divided among the ranks of the process group. Each rank
             passes its own Gaussians and views, the same number of views as the others, and gets the images of
             its own views, which show the Gaussians of all ranks. Every rank must make this call and run its
             backward pass. As in gsplat, meta's splats are those of this rank's Gaussians in the views of all
             ranks, and its tile lists belong to this rank's images.
         camera_model: "pinhole", or with `with_ut` OpenCV's "fisheye".
-        segmented: accepted and not needed: it selects a sort in gsplat, never the result.
         covars: [..., N, 3, 3] covariances instead of quats and scales; only their upper triangles are read.
             They are decomposed, which costs more than the rest of the call; quats and scales are faster.
         return_normals: whether to render normals into `meta["normals"]`, [..., C, H, W, 3]: the sum of
@@ -145,10 +144,9 @@ def rasterization(
         with_ut: project by the unscented transform (docs/design.md), as in gsplat's main branch: images
             are distorted as their lenses are. Every Gaussian is projected into every view. Not with covars,
             sparse_grad, distributed, torch.compile or gradients of viewmats.
-        radial_coeffs: OpenCV's k1 to k6, [..., C, 6], or of a fisheye k1 to k4, [..., C, 4]; None: zeros, as
-            of the next two. Lenses and viewmats_rs get no gradient.
-        tangential_coeffs: p1 and p2, [..., C, 2].
-        thin_prism_coeffs: s1 to s4, [..., C, 4].
+        radial_coeffs, tangential_coeffs, thin_prism_coeffs: OpenCV's k1 to k6, [..., C, 6], p1 and p2, [...,
+            C, 2], and s1 to s4, [..., C, 4]; or of a fisheye k1 to k4, [..., C, 4], alone. None: zeros.
+            Lenses and viewmats_rs get no gradient.
         rolling_shutter: gsplat's `RollingShutterType`, or its name: which row or column is exposed first;
             None: "GLOBAL".
         viewmats_rs: poses at the end of a rolling shutter's frame, [..., C, 4, 4]; at its begin the camera is
@@ -195,12 +193,8 @@ def rasterization(
     required: dict[str, object] = {"means": means, "opacities": opacities, "viewmats": viewmats, "Ks": Ks}
     if covars is None:
         required |= {"quats": quats, "scales": scales}
-    lens = {
-        "radial_coeffs": radial_coeffs,
-        "tangential_coeffs": tangential_coeffs,
-        "thin_prism_coeffs": thin_prism_coeffs,
-        "viewmats_rs": viewmats_rs,
-    }
+    lens = {"radial_coeffs": radial_coeffs, "tangential_coeffs": tangential_coeffs}
+    lens |= {"thin_prism_coeffs": thin_prism_coeffs, "viewmats_rs": viewmats_rs}
     given = {"colors": colors, "backgrounds": backgrounds, "covars": covars, "extra_signals": extra_signals}
     check_tensors(required, given | lens)
     of_lenses = (rolling_shutter, ut_params, *lens.values())
@@ -210,9 +204,8 @@ def rasterization(
         # Placeholders, which the decomposition of the covariances replaces.
         quats, scales = (means.new_zeros(()).expand(*means.shape[:-1], length) for length in (4, 3))
     assert quats is not None and scales is not None
-    gaussians = gaussians_of(
-        "rasterization", means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, render_mode
-    )
+    scene = Scene(means, quats, scales, opacities, colors, viewmats, Ks)
+    gaussians = gaussians_of("rasterization", scene, sh_degree, render_mode)
     if sparse_grad and len(gaussians.lead) > 1:
         raise ValueError("sparse_grad does not support batch dimensions; leave one of them out")
     if extra_signals is not None:
@@ -223,24 +216,20 @@ def rasterization(
         gaussians = with_covariances(gaussians, covars, sparse_grad, return_normals)
     if with_ut:
         refused = {"covars": covars is not None, "sparse_grad": sparse_grad, "distributed": distributed}
-        gaussians = with_lenses(gaussians, camera_model, rolling_shutter, ut_params, refused, **lens)
-    background = None
-    if backgrounds is not None:
-        background = background_rows(backgrounds, gaussians, render_mode, return_normals)
+        gaussians = with_lenses(gaussians, camera_model, rolling_shutter, ut_params, refused, lens)
+    background = background_rows(backgrounds, gaussians, render_mode, return_normals)
     if pixels is not None and (distributed or torch.compiler.is_compiling()):
         raise ValueError("pixels support neither distributed=True nor torch.compile; leave one out")
-    listed = None
-    if pixels is not None or image_ids is not None:
-        listed = checked_pixels(pixels, image_ids, gaussians.images, width, height)
+    listed = checked_pixels(pixels, image_ids, gaussians.images, width, height)
     image = ImageOptions(
         render_mode, background, packed, sparse_grad, absgrad, return_normals, return_median, listed
     )
-    job = None
+    ranks = None
     if distributed:
         same = (width, height, projection.tile_size, render_mode, return_normals)
-        gaussians, job = gather_views(gaussians, absgrad, same)
+        gaussians, ranks = gather_views(gaussians, absgrad, same)
     try:
-        return render(gaussians, projection, image, job=job)
+        return render(gaussians, projection, image, ranks=ranks)
     except (RuntimeError, MemoryError) as error:
         explain_memory(error, gaussians.images, width, height, means.shape[-2], means.device)
         raise

@@ -7,7 +7,7 @@ import inspect
 import math
 from collections.abc import Iterable, Mapping
 from functools import cache
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,6 +19,7 @@ from blitzgs.call.arguments import (
     GSPLAT_DEFAULTS,
     KERNEL_SH_DEGREE,
     RENDER_MODES,
+    Scene,
     check_choice,
     check_further,
     check_tensors,
@@ -26,19 +27,9 @@ from blitzgs.call.arguments import (
     gaussians_of,
 )
 from blitzgs.call.channels import ImageOptions, background_rows
-from blitzgs.call.groups import ShTables, gathered_groups, groups_may_be_queued, groups_of
-from blitzgs.call.images import render
 from blitzgs.call.rasterize import rasterization
+from blitzgs.call.render import ShTables, gathered_groups, groups_may_be_queued, groups_of, render
 from blitzgs.ops.derivatives import of_shape
-
-
-class CatchesUp(Protocol):
-    """An optimiser that may have pending steps, such as `blitzgs.optim.LazyAdam`."""
-
-    def catch_up(
-        self, params: Iterable[Tensor] | None = None, rows: Tensor | None = None, count: Tensor | None = None
-    ) -> None:
-        """Apply the pending steps of rows of parameters, see `blitzgs.optim.LazyAdam.catch_up`."""
 
 
 @not_compiled
@@ -64,7 +55,7 @@ def raw_rasterization(
     sparse_grad: bool = True,
     absgrad: bool = False,
     rasterize_mode: str = "classic",
-    optimizers: CatchesUp | Iterable[Any] | Mapping[str, Any] = (),
+    optimizers: Any = (),
     **further: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render Gaussians from the parameters that gsplat's trainer learns, before their activation.
@@ -81,23 +72,11 @@ def raw_rasterization(
         opacities: [N] or [N, 1] logits.
         sh0: [N, 1, 3] or [N, 3], the first SH coefficient; or all of them, [N, K, 3], with shN None.
         shN: [N, K - 1, 3], the other SH coefficients.
-        viewmats: [C, 4, 4] world to camera, a rotation and a translation.
-        Ks: [C, 3, 3] intrinsics in px, without skew and with a last row 0, 0, 1. They get no gradient.
-            Others are refused; under `torch.compile` nothing is rendered with them.
-        width: image width in px.
-        height: image height in px.
-        near_plane: Gaussians have z > near_plane, world units; less than far_plane.
-        far_plane: Gaussians have z <= far_plane, world units.
-        radius_clip: drop splats whose radii in meta are both at most this, px, at least 0.
-        eps2d: variance added to both screen axes, px^2, at least 0.
+        viewmats, Ks, width, height, near_plane, far_plane, radius_clip, eps2d, tile_size, backgrounds,
+            render_mode, absgrad, rasterize_mode: as in `blitzgs.rasterization`, without batch dimensions.
         sh_degree: degree to evaluate, 0 to 3; None: the highest degree that the coefficients have.
-        tile_size: edge of a tile in px, 1 to 64; None: 16. The image is the same, on CUDA to rounding.
-        backgrounds: [C, D] behind everything; None for zero. Depth channels have none.
-        render_mode: "RGB", "D" (accumulated z), "ED" (expected z), "RGB+D" or "RGB+ED".
         sparse_grad: False: dense gradients, for parameters that are not leaves (`means + offsets`), and for
             optimisers, gradient clipping and torch's DistributedDataParallel, which take no others.
-        absgrad: as in `blitzgs.rasterization`.
-        rasterize_mode: "classic" or "antialiased".
         optimizers: the parameters' optimisers: one, a mapping or a sequence. Each `blitzgs.optim.LazyAdam`
             among them catches up the rows that this call reads: the geometry of all Gaussians, and the SH of
             the visible ones.
@@ -107,15 +86,9 @@ def raw_rasterization(
     Returns:
         As `blitzgs.rasterization(..., packed=True)`.
 
-    Warns:
-        RuntimeWarning: as `blitzgs.rasterization`.
-
-    Raises:
-        TypeError: an argument is not a tensor, or not the kind of number it should be, or gsplat has no such
-            argument; or the tensors are neither float32 nor float64; or `optimizers` are no optimisers.
-        ValueError: an argument is not supported, has a wrong shape or value, or another dtype or device than
-            the others; or a parameter is not a leaf, but would get a sparse gradient. The message names it.
-        RuntimeError: float64 tensors are on a GPU, or the call is inside a transform of `torch.func`.
+    Warns, raises:
+        As `blitzgs.rasterization`; also a TypeError if `optimizers` are no optimisers, and a ValueError if a
+        parameter is not a leaf, but would get a sparse gradient. The message names it.
     """
     if further:
         check_further("raw_rasterization", further, _defaults())
@@ -141,9 +114,8 @@ def raw_rasterization(
         tensors["sh0"] = sh0 = harmonics[0] = of_shape(sh0, (len(sh0), 1, 3))
     sh_degree = _checked_degree(harmonics, len(means), sh_degree, shaded)
     projection = projection._replace(sh_degree=sh_degree)
-    whole = gaussians_of(
-        "raw_rasterization", means, quats, scales, opacities, None, viewmats, Ks, None, "D", raw=True
-    )
+    scene = Scene(means, quats, scales, opacities, None, viewmats, Ks)
+    whole = gaussians_of("raw_rasterization", scene, None, "D", raw=True)
     if sparse_grad and torch.is_grad_enabled():
         _check_leaves(params | sh_params if shaded else params)
     given = {**tensors, "viewmats": viewmats, "Ks": Ks, "shN": shN}
@@ -164,7 +136,7 @@ def raw_rasterization(
     if groups_may_be_queued(groups):
         return render(gaussians, projection, image, tables=tables, groups=groups)
     # Several groups, no Gaussians, or another tile size: gather the Gaussians that any group sees.
-    groups = gathered_groups(groups, tables)
+    groups = gathered_groups(groups, tables, sparse_grad)
     return render(gaussians, projection, image, groups=groups)
 
 
@@ -186,7 +158,8 @@ def _check_leaves(params: Mapping[str, Tensor]) -> None:
             )
 
 
-def _lazy(optimizers: Any) -> list[CatchesUp]:
+def _lazy(optimizers: Any) -> list[Any]:
+    """Return the optimisers that may have pending steps, as `blitzgs.optim.LazyAdam`."""
     if isinstance(optimizers, torch.optim.Optimizer) or hasattr(optimizers, "catch_up"):
         optimizers = [optimizers]
     if not isinstance(optimizers, Iterable):

@@ -62,11 +62,9 @@ class DefaultStrategy(Strategy):
         grow_grad2d: mean gradient of the projected mean, in half images, above which a Gaussian grows.
         grow_scale3d: Gaussians up to this size are cloned, larger ones split; in units of `scene_scale`.
         grow_scale2d: Gaussians of a larger radius are split; in units of the longer side of the image.
-        prune_scale3d: after the first reset, larger Gaussians are pruned; in units of `scene_scale`.
-        prune_scale2d: the same for the radius.
+        prune_scale3d, prune_scale2d: after the first reset, larger Gaussians are pruned, in the same units.
         refine_scale2d_stop_iter: step from which radii do not count; 0: they never do.
-        refine_start_iter: refinement begins after this step.
-        refine_stop_iter: and ends at this one.
+        refine_start_iter, refine_stop_iter: refinement begins after the first step and ends at the second.
         reset_every: steps between two resets of the opacities to at most twice `prune_opa`, as in gsplat's
             main branch; a slip in the condition of 1.5.3 leaves them out.
         refine_every: steps between two refinements.
@@ -237,8 +235,7 @@ class MCMCStrategy(Strategy):
     Attributes:
         cap_max: number of Gaussians at which the population stops growing; relocation goes on.
         noise_lr: the noise's strength is this times the learning rate of the means.
-        refine_start_iter: refinement begins after this step.
-        refine_stop_iter: and ends at this one.
+        refine_start_iter, refine_stop_iter: refinement begins after the first step and ends at the second.
         noise_injection_stop_iter: step from which there is no noise; -1: there always is.
         refine_every: steps between two refinements, each of which adds 5 %.
         min_opacity: Gaussians up to this opacity are dead.
@@ -289,10 +286,7 @@ class MCMCStrategy(Strategy):
 
         Args:
             params: changed in place: means move, and a refinement replaces the entries.
-            optimizers: as in `DefaultStrategy`.
-            state: from `initialize_state`.
-            step: number of the step.
-            info: not read.
+            optimizers, state, step: as in `DefaultStrategy`; `info` is not read.
             lr: learning rate of the means.
             scene: told of the changes (`on_relocate`, `on_sample_add`), as gsplat's main branch has it.
         """

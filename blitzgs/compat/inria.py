@@ -34,10 +34,8 @@ class GaussianRasterizationSettings(NamedTuple):
     """A view and how to render it; the fields of INRIA's class of this name, in its order.
 
     Attributes:
-        image_height: px.
-        image_width: px.
-        tanfovx: tangent of half the horizontal field of view.
-        tanfovy: tangent of half the vertical field of view.
+        image_height, image_width: px.
+        tanfovx, tanfovy: tangents of half the horizontal and vertical field of view.
         bg: [C], the background.
         scale_modifier: factor of the scales; `cov3D_precomp` ignores it.
         viewmatrix: [4, 4] or [1, 4, 4], world to camera for row vectors: the transpose of the usual matrix. A
@@ -46,8 +44,7 @@ class GaussianRasterizationSettings(NamedTuple):
             focal lengths must be those of tanfovx and tanfovy.
         sh_degree: degree to evaluate, 0 to 3.
         campos: [3], the camera's centre; must fit `viewmatrix` if SH are rendered.
-        prefiltered: accepted, without effect.
-        debug: accepted, without effect.
+        prefiltered, debug: accepted, without effect.
         antialiasing: whether opacities are compensated for the blur. None is the class without this field:
             the rasteriser then returns no inverse depths.
     """
@@ -253,14 +250,11 @@ def _project(
     if decomposed is not None:
         rotations, scales = decomposed.quats, decomposed.scales
     assert rotations is not None and scales is not None
+    width, height, degree = map(int, (settings.image_width, settings.image_height, settings.sh_degree))
     options = ProjectionOptions(
-        int(settings.image_width),
-        int(settings.image_height),
-        sh_degree=int(settings.sh_degree) if sh is not None else 0,
-        near_plane=NEAR,
-        antialiased=bool(settings.antialiasing),
-        raw=False,
-    )
+        width, height, sh_degree=0 if sh is None else degree, near_plane=NEAR,
+        antialiased=bool(settings.antialiasing), raw=False,
+    )  # fmt: skip
     cameras = (settings.viewmatrix.to(means).reshape(1, 4, 4).mT.contiguous(), K)
     gaussians = gaussian_tensors(means, rotations, scales, opacities.reshape(-1), sh)
     inputs = ProjectionInputs(gaussians, cameras, options)
@@ -334,10 +328,7 @@ def _with_gradients_of(
     """
     shapes = [None if tensor is None else tensor.shape for tensor in screen]
 
-    def back(
-        saved: Sequence[Tensor], needed: Sequence[bool], v: Sequence[Tensor | None]
-    ) -> list[Tensor | None]:
-        ids, half = saved
+    def back(needed: Sequence[bool], v: Sequence[Tensor | None]) -> list[Tensor | None]:
         v_means2d = torch.zeros_like(means2d) if v[0] is None else v[0]
         found = (v_means2d, absolute.pop() if absolute else v_means2d.abs())
 
@@ -352,5 +343,5 @@ def _with_gradients_of(
 
         return [v_means2d, *first_only("GaussianRasterizer", spread, [v_means2d])]
 
-    (passed,) = linear_map(lambda means2d, *_: (means2d.clone(),), back, [means2d, *screen], [ids, half])
+    (passed,) = linear_map(lambda means2d, *_: (means2d.clone(),), back, [means2d, *screen])
     return passed

@@ -27,8 +27,7 @@ _MAX_NUMBERS = 8192
 # Divisions use the costs of a batch only after this number of later batches. By then the host has read the
 # sums of the batch, with its losses. It therefore does not wait, and all ranks have the same costs.
 _DELAY = 2
-# The costs of a view that was not visited yet are estimated as the mean costs of this number of other views,
-# those that were visited last.
+# A view that was not visited yet has the mean costs of this number of the latest others.
 _SIMILAR = 16
 # The costs of such a view.
 _UNKNOWN = torch.empty(0, dtype=torch.float16)
@@ -55,10 +54,9 @@ def _measured(sums: HostSum, keys: Sequence[Hashable], tiles: int, first: int) -
 
 
 class TileOwners:
-    """Divides the tiles of each batch by their costs at the last visit of each view.
+    """Divides the tiles of each batch by their costs at the last visit of each view, at most 16 KB a view.
 
-    Every rank has the same costs, so all ranks compute the same division without communication. The costs of
-    a view take at most 16 KB. The host does not wait to divide a batch.
+    Every rank has the same costs, so all ranks compute the same division without communication or waiting.
     """
 
     def __init__(self, ranks: Ranks) -> None:
@@ -69,11 +67,7 @@ class TileOwners:
         self._planned: dict[int, tuple[int, ...]] = {}
 
     def plan(self, step: int, keys: Sequence[Hashable], width: int, height: int, halo: int) -> TileRanges:
-        """Divide the tiles of the batch of a later step, as `divide` does, and store the division.
-
-        `step`: step of the batch; its division is stored until `forget_before`. `keys`: identifies each of
-        the B views. `halo`: see `TileRanges`.
-        """
+        """Divide the tiles of a later step as `divide` does; keep the division until `forget_before`."""
         if step in self._planned:
             ranges = TileRanges(self._planned[step], len(keys), width, height, halo=halo)
             # The resolution of the step may have changed since, with the pace of the run.
@@ -131,11 +125,7 @@ class TileOwners:
     def divide(
         self, keys: Sequence[Hashable], width: int, height: int, tile_size: int = 16, halo: int = 0
     ) -> TileRanges:
-        """Divide the tiles of a batch.
-
-        `keys`: identifies each of the B views. `halo`: see `TileRanges`. Returns ranges whose costs differ
-        from equal shares by at most the cost of one tile.
-        """
+        """Divide the tiles of B views, named by keys, into ranges of equal cost to within one tile."""
         tiles = math.prod(tile_counts(width, height, tile_size))
         found = [self._costs.get(key) for key in keys]
         costs = [_UNKNOWN if cost is None or cost.tiles != tiles else cost.pieces for cost in found]
@@ -150,11 +140,10 @@ class TileOwners:
     ) -> HostSum:
         """Store the costs of a batch's tiles for divisions from the batch after the next on. Collective.
 
-        On CUDA the host does not wait for a batch whose losses it has read.
-
         `tile_work`: int32 [B * T], number of list entries that were composited in each tile. `ranges`: the
-        tiles of each rank; the cost of a tile is that measured by its owner. `parts`: float64 [B, K, 2], sums
-        of this rank's loss, which are sent together with the costs. Returns the sums; see `HostSum.read`.
+        tiles of each rank, which measures their costs. `parts`: float64 [B, K, 2], sums of this rank's loss,
+        which are sent together with the costs. Returns the sums (`HostSum.read`); on CUDA the host does not
+        wait for a batch whose losses it has read.
         """
         if len(self._delayed) == _DELAY:
             self._learn(self._delayed.popleft())

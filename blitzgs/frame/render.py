@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Renders views of a table and their gradients without autograd, in the one loop over attempts.
 
-`render_frame` projects the active Gaussians, lists them by tile and composites them; the result is a `Frame`.
-`backward_splats` computes the gradients of the projected splats from the gradients of the images. `survey`
-measures what each Gaussian contributes to each view. No tensor here is as long as the table: the cost follows
-the Gaussians that the views see. Between projection and tile intersection, a transport
-(`blitzgs.frame.transport`) sends the splats to the ranks that composite them, and later returns their
-gradients.
+No tensor here is as long as the table: the cost follows the Gaussians that the views see. Between projection
+and lists, a transport sends the splats to the ranks that composite them, and later returns their gradients.
 """
 
 from __future__ import annotations
@@ -14,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -23,14 +19,13 @@ from blitzgs._library import below_autograd
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import open_transport
 from blitzgs.frame.transport.protocol import (
-    Arrived,
     Exchange,
     ExchangeResult,
     Transport,
     WayBack,
     stage_ended,
 )
-from blitzgs.ops.blocks import ActiveRows, GateRules
+from blitzgs.ops.blocks import ActiveRows
 from blitzgs.ops.intersect import TileGrid
 from blitzgs.ops.projection_types import (
     ProjectedSplats,
@@ -40,7 +35,7 @@ from blitzgs.ops.projection_types import (
     Splats,
     Views,
 )
-from blitzgs.ops.splat_gradients import GradientBuffer, RasterizeSaved, SplatGradients
+from blitzgs.ops.rasterize import GradientBuffer, RasterizeSaved, SplatGradients
 from blitzgs.table.table import GaussianTable
 
 
@@ -56,8 +51,7 @@ class RenderOptions:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB behind everything
     tile_size: int = 16  # pixels
     deterministic: bool = False  # gradients repeat bit for bit on CUDA too (they always do on the CPU)
-    # Opacities fade by octree level and distance, `blitzgs.view.gate.LodGate.fade`; empty: they do not.
-    fade: tuple[float, ...] = ()
+    fade: tuple[float, ...] = ()  # `blitzgs.view.gate.LodGate.fade`; empty: opacities do not fade
 
     @property
     def limits(self) -> tuple[float, float, float]:
@@ -67,27 +61,9 @@ class RenderOptions:
     def projection(self, views: Views) -> ProjectionOptions:
         """Return the options for projecting into these views."""
         return ProjectionOptions(
-            width=views.width,
-            height=views.height,
-            tile_size=self.tile_size,
-            sh_degree=self.sh_degree,
-            near_plane=self.near_plane,
-            far_plane=self.far_plane,
-            eps2d=self.eps2d,
-            antialiased=self.antialiased,
-            fade=self.fade,
-        )
-
-
-class ViewFilter(Protocol):
-    """What the views of a batch leave out before projection; frames and steps know no more of it."""
-
-    @property
-    def columns(self) -> Sequence[int]:
-        """The views' columns in the table's cull matrix; empty: no view has a mask."""
-
-    def rules(self, table: GaussianTable) -> GateRules:
-        """Return the rules for a table, as the ops take them."""
+            views.width, views.height, self.tile_size, self.sh_degree, *self.limits,
+            antialiased=self.antialiased, fade=self.fade,
+        )  # fmt: skip
 
 
 class Frame(NamedTuple):
@@ -99,8 +75,7 @@ class Frame(NamedTuple):
     splats: Splats  # the splats that this rank composited: its own, or those that it received
     assignment: TileAssignment | None  # the tiles of each rank; None: one rank composites all
     way_back: WayBack | None  # returns the gradients of splats to their owners; None: one rank owns all
-    # int64 [B], Gaussians visible in each view, over all ranks; valid until the next exchange.
-    visible: Tensor
+    visible: Tensor  # int64 [B], Gaussians seen by each view, of all ranks; valid until the next exchange
     active: ActiveRows | None  # rows that were considered, and the views of each; None: all
     renders: Tensor  # [B, H, W, 3]; undefined in pixels that only other ranks composite
     tile_work: Tensor  # int32 [B * T], list entries each composited tile went through
@@ -119,33 +94,22 @@ class Frame(NamedTuple):
 
 def render_frame(
     table: GaussianTable,
-    views: Views,
-    options: RenderOptions,
+    views: Views,  # at most 32 views
+    options: RenderOptions,  # how to render
+    # rows to consider, and the views of each; None: all rows in all views. Or a function that finds them,
+    # given the capacity for the frame (see `run_attempts`).
     active: ActiveRows | Callable[[Sizes | None], ActiveRows] | None = None,
-    assignment: TileAssignment | None = None,
+    assignment: TileAssignment | None = None,  # tiles of each rank (collective); None: all are here
+    # sends the splats to the ranks that composite them; used for several frames, it estimates their sizes, so
+    # that the device need not wait for the host. None: a new one.
     transport: Transport | None = None,
-    backward_follows: bool = False,
-    backgrounds: Tensor | None = None,
+    backward_follows: bool = False,  # makes a backward pass faster, which also works without
+    backgrounds: Tensor | None = None,  # colours [B, 3] behind everything; None: of the options
 ) -> Frame:
     """Render views of a table whose active rows have no pending optimiser steps.
 
-    Args:
-        views: at most 32 views.
-        options: how to render.
-        active: rows to consider, and the views of each; None: all rows in all views. Or a function that finds
-            them, given the capacity for the frame (see `run_attempts`).
-        assignment: the tiles of each rank; every rank of the job calls this with its table. None: render all
-            tiles from this table alone.
-        transport: sends the splats to the ranks that composite them. A transport that is used for several
-            frames estimates the sizes of a frame from the frames before, so that the device need not wait for
-            the host; the result does not depend on it. None: a new one.
-        backward_follows: prepare for a backward pass, which is then faster; the backward pass also works
-            without.
-        backgrounds: the colour behind everything in each view, float32 [B, 3]; None: that of the options.
-
-    Returns:
-        The frame; its images do not depend on the order of the table's rows, on inactive rows, or on how many
-        ranks shared the work.
+    Returns the frame; its images do not depend on the order of the table's rows, on inactive rows, or on how
+    many ranks shared the work.
     """
     transport = transport or open_transport(None if assignment is None else assignment.ranks)
     grid = tile_grid(views, options, assignment)
@@ -161,42 +125,31 @@ def render_frame(
     result, (rows, lists, images, zeros) = run_attempts(transport, attempt)
     renders, transmittances, last_ids, tile_work, packed_splats, tile_order = images
     splats = result.splats
+    columns = [splats.means2d, splats.conics, splats.opacities, splats.colors]
+    saved = RasterizeSaved(columns, backgrounds, lists, [transmittances, last_ids, packed_splats, tile_order])
+    others = None if result.way_back is None else result.way_back.cleared_table
     return Frame(
-        views=views,
-        options=options,
-        projected=result.projected,
-        splats=splats,
-        assignment=assignment,
-        way_back=result.way_back,
-        visible=result.visible,
-        active=rows,
-        renders=renders,
-        tile_work=tile_work,
-        saved=RasterizeSaved(
-            [splats.means2d, splats.conics, splats.opacities, splats.colors],
-            backgrounds,
-            lists,
-            [transmittances, last_ids, packed_splats, tile_order],
-        ),
-        gradients=GradientBuffer(zeros, None if result.way_back is None else result.way_back.cleared_table),
-    )
+        views, options, result.projected, splats, assignment, result.way_back, result.visible, rows, renders,
+        tile_work, saved, GradientBuffer(zeros, others),
+    )  # fmt: skip
 
 
 def _composite(
     exchange: Exchange, grid: TileGrid, backgrounds: Tensor | None, backward_follows: bool
 ) -> tuple[list[Tensor], Sequence[Tensor], Tensor | None]:
     """Return the tiles' lists, what `rasterize_fwd` returns, and zeros for the gradients of splats."""
-    splats, n_splats, _ = exchange.arrived
-    lists = tile_lists(exchange.arrived, grid)
+    splats, lists = exchange.arrived, tile_lists(exchange, grid)
     stage_ended("sort")
     geometry = (splats.means2d, splats.conics, splats.opacities)
     arguments = (*geometry, splats.colors, backgrounds, *lists, *grid)
     shared = exchange.gradient_table
     if shared is not None and backward_follows:
-        images = torch.ops.blitzgs.rasterize_fwd_(*arguments, shared, n_splats)
+        images = torch.ops.blitzgs.rasterize_fwd_(*arguments, shared, exchange.n_splats)
         zeros = shared
     else:
-        *images, zeros = torch.ops.blitzgs.rasterize_fwd(*arguments, False, backward_follows, n_splats)
+        *images, zeros = torch.ops.blitzgs.rasterize_fwd(
+            *arguments, False, backward_follows, exchange.n_splats
+        )
         if shared is not None:
             zeros = None  # the gradients must be in `shared`, which the backward pass then zeroes
     stage_ended("raster")
@@ -217,12 +170,12 @@ def inputs_of(
     return ProjectionInputs(gaussians, cameras, options.projection(views), active or (), table["id"], level)
 
 
-def tile_lists(arrived: Arrived, grid: TileGrid) -> list[Tensor]:
+def tile_lists(exchange: Exchange, grid: TileGrid) -> list[Tensor]:
     """Return the splats that each tile composites and where the list of each tile begins (op `intersect`)."""
-    splats, n_splats, n_isects = arrived
+    splats = exchange.arrived
     lists = torch.ops.blitzgs.intersect(
         splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, splats.ids,
-        *grid, n_isects, n_splats, True,
+        *grid, exchange.n_isects, exchange.n_splats, True,
     )  # fmt: skip
     return list(lists)
 
@@ -274,11 +227,10 @@ def run_attempts(
 ) -> tuple[ExchangeResult, Outputs]:
     """Queue a frame's work, without gradients, until all results had enough memory.
 
-    `attempt`: given the capacity that `transport` estimates (None: the sizes are not known, and the work
-    waits for them), projects and sends the splats with `transport`, and queues the work with those that
-    arrive. It returns the exchange and the outputs of this work, and keeps neither: another attempt needs
-    their memory. Returns the splats, cut to their numbers, and the outputs of the last attempt. RuntimeError:
-    `MAX_ATTEMPTS` attempts did not suffice, each with the sizes that the last one needed.
+    `attempt`: given the capacity that `transport` estimates (None: the work waits for the sizes), projects
+    and sends the splats, and queues the work with those that arrive. It returns the exchange and the outputs
+    of this work, and keeps neither: another attempt needs their memory. Returns the splats, cut to their
+    numbers, and the outputs of the last attempt. RuntimeError: `MAX_ATTEMPTS` attempts did not suffice.
     """
     for _ in range(MAX_ATTEMPTS):
         capacity = None if transport.estimate is None else transport.estimate.sizes
@@ -303,33 +255,22 @@ class Survey(NamedTuple):
     splats: ProjectedSplats  # the projected Gaussians
     weights: Tensor  # int64 [P], sum of alpha T over the pixels in units of 2^-32
     pixels: Tensor  # int32 [P], the number of pixels at which a splat is composited
-    # int64 [P], sum of (alpha T)^2 over these pixels in the same units, if asked for.
-    squares: Tensor | None = None
+    squares: Tensor | None = None  # int64 [P], sum of (alpha T)^2 in these units, if asked for
 
 
 def survey(
     table: GaussianTable,
-    views: Views,
-    options: RenderOptions,
-    assignment: TileAssignment | None = None,
-    transport: Transport | None = None,
-    active: ActiveRows | None = None,
-    squares: bool = False,
+    views: Views,  # at most 32 views
+    options: RenderOptions,  # how to render; no colour is computed
+    assignment: TileAssignment | None = None,  # tiles of each rank (collective); None: all are here
+    transport: Transport | None = None,  # as for `render_frame`
+    active: ActiveRows | None = None,  # as for `render_frame`
+    squares: bool = False,  # whether to sum the squares as well
 ) -> Survey:
     """Measure what each Gaussian contributes to views of a table without pending optimiser steps.
 
-    Args:
-        views: at most 32 views.
-        options: how to render; no colour is computed.
-        assignment: the tiles of each rank; every rank of the job calls this with its table. None: this rank
-            composites all tiles.
-        transport: as for `render_frame`.
-        active: as for `render_frame`.
-        squares: whether to sum the squares as well.
-
-    Returns:
-        The splats of this rank's Gaussians with the sums over the tiles of all ranks; the bits do not depend
-        on the number of ranks.
+    Returns the splats of this rank's Gaussians with the sums over the tiles of all ranks; the bits do not
+    depend on the number of ranks.
     """
     transport = transport or open_transport(None if assignment is None else assignment.ranks)
     inputs = inputs_of(table, views, options, active, colored=False)
@@ -337,10 +278,9 @@ def survey(
 
     def attempt(capacity: Sizes | None) -> tuple[Exchange, tuple[Tensor, Tensor, Tensor]]:
         exchange = transport.project_and_send(inputs, assignment, capacity)
-        splats, n_splats, _ = exchange.arrived
-        lists = tile_lists(exchange.arrived, grid)
+        splats, lists = exchange.arrived, tile_lists(exchange, grid)
         geometry = (splats.means2d, splats.conics, splats.opacities)
-        return exchange, torch.ops.blitzgs.contributions(*geometry, *lists, *grid, n_splats, squares)
+        return exchange, torch.ops.blitzgs.contributions(*geometry, *lists, *grid, exchange.n_splats, squares)
 
     result, sums = run_attempts(transport, attempt)
     columns = [column[: len(result.splats.depths)] for column in (sums if squares else sums[:2])]

@@ -16,8 +16,7 @@ from blitzgs.ops.intersect import pixels_of_tiles, tile_counts
 if TYPE_CHECKING:
     from blitzgs.distributed.group import Ranks
 
-# The loss of an owned pixel reads pixels up to this distance: 5 px for its window, and 5 more for the
-# gradient.
+# The loss of an owned pixel reads pixels up to this distance: 5 px of its window, 5 of the gradient.
 LOSS_HALO = 10
 
 
@@ -33,9 +32,8 @@ class TileRanges:
     width: int  # image width in pixels
     height: int  # image height in pixels
     tile_size: int = 16  # tile edge in pixels
-    # A rank also composites the tiles within this many pixels of its own; a tile that several ranks composite
-    # has the same bits on each. With `LOSS_HALO` a rank can compute its loss without pixels of other ranks.
-    # 0: only its own tiles.
+    # A rank also composites the tiles within this many pixels of its own, which have the same bits on each.
+    # With `LOSS_HALO` it can compute its loss without pixels of other ranks. 0: only its own tiles.
     halo: int = 0
 
     @cached_property
@@ -55,8 +53,8 @@ class TileRanges:
     def composited(self, rank: int) -> tuple[int, int]:
         """Return the [first, one past last) tile that a rank composites: its own and those within `halo`.
 
-        The range may contain a few further tiles, because it is contiguous in the flattened order; it never
-        leaves the view. It is empty for a rank without tiles. The first tiles ascend with the ranks.
+        The range is contiguous and may contain a few further tiles, but never leaves the view. It is empty
+        for a rank without tiles. The first tiles ascend with the ranks.
         """
         begin, end = self.of(rank)
         ring = -(-self.halo // self.tile_size)
@@ -71,10 +69,7 @@ class TileRanges:
         return pixels_of_tiles(self.n_views, self.width, self.height, self.tile_size, *self.of(rank), device)
 
     def pixel_rows(self, rank: int) -> list[tuple[int, int]]:
-        """Return the rows [y0, y1) of each view's image that the loss of a rank's tiles reads.
-
-        (0, 0) for a view of which the rank owns no tile.
-        """
+        """Return the rows [y0, y1) of each view that the loss of a rank reads; (0, 0) without tiles."""
         (begin, end), tiles_x, tiles_per_view = self.of(rank), self.tiles_x, self.tiles_per_view
         rows = []
         for first in range(0, self.n_views * tiles_per_view, tiles_per_view):
@@ -98,33 +93,23 @@ class TileAssignment:
 
 
 def collect_images(renders: Tensor, ranges: TileRanges, ranks: Ranks, destination: int) -> None:
-    """Send all pixels of a rendering to one rank, which stores them in its `renders`, bit for bit.
-
-    `renders`: [B, H, W, C], contiguous; valid in this rank's tiles. `destination`: the rank whose `renders`
-    is complete afterwards.
-    """
+    """Send all pixels of a rendering, [B, H, W, C], contiguous, to one rank, whose `renders` gets them."""
     if ranks.world_size == 1:
         return
-    here, area = ranks.rank == destination, ranges.tile_size**2
-    owned = {rank: ranges.of(rank) for rank in range(ranks.world_size)}
+    here, others = ranks.rank == destination, [rank != destination for rank in range(ranks.world_size)]
+    owned = [ranges.of(rank) for rank in range(ranks.world_size)]
     outgoing = [] if here else [owned[ranks.rank]]
-    incoming = [stretch for rank, stretch in owned.items() if here and rank != destination]
-    sent, received = [0] * ranks.world_size, [0] * ranks.world_size
-    if here:
-        received = [area * (end - begin) * (rank != destination) for rank, (begin, end) in owned.items()]
-    else:
-        sent[destination] = area * sum(end - begin for begin, end in outgoing)
+    incoming = [stretch for stretch, other in zip(owned, others, strict=True) if here and other]
+    pixels = [ranges.tile_size**2 * (end - begin) for begin, end in owned]
+    sent = [pixels[ranks.rank] * (not here and not other) for other in others]
+    received = [n * (here and other) for n, other in zip(pixels, others, strict=True)]
     flat = renders.view(-1, renders.shape[-1])
     arrived = ranks.all_to_all(flat[_pixels(outgoing, ranges, renders.device)], sent, received)
     flat[_pixels(incoming, ranges, renders.device)] = arrived
 
 
 def _pixels(stretches: list[tuple[int, int]], ranges: TileRanges, device: torch.device) -> Tensor:
-    """List the flat pixel indices of stretches of tiles, tile by tile, tile_size^2 each.
-
-    Tiles that extend beyond the image repeat its border pixels, in the same way on the sender and the
-    receiver.
-    """
+    """List the flat pixels of stretches of tiles, tile by tile; beyond the image, its border is repeated."""
     parts = [torch.arange(low, high, device=device) for low, high in stretches]
     tiles = torch.cat(parts) if parts else torch.empty(0, dtype=torch.int64, device=device)
     view, tile = tiles // ranges.tiles_per_view, tiles % ranges.tiles_per_view

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from blitzgs._torch import mark_coalesced, raw_indices, raw_values, refusing_derivatives
 
-# Maps saved tensors, which inputs need a gradient, and the gradients of the outputs to those of the inputs.
-Adjoint = Callable[[Sequence[Tensor], Sequence[bool], Sequence[Tensor | None]], Sequence[Tensor | None]]
+# Maps which inputs need a gradient, and the gradients of the outputs, to those of the inputs.
+Adjoint = Callable[[Sequence[bool], Sequence[Tensor | None]], Sequence[Tensor | None]]
 
 
 def first_only(
@@ -23,11 +23,9 @@ def first_only(
 
     Autograd sees no connection between a hand-written gradient and the op's inputs, so a second derivative
     would silently be zero. When torch records the backward pass (`create_graph=True`), this function
-    therefore connects the gradients with all inputs through a function whose backward pass raises an error.
-
-    `op`: its name, for errors. `compute`: returns gradients of the op's inputs; autograd records nothing of
-    it. `inputs`: what these depend on: the op's inputs and the gradients of its outputs. RuntimeError: the
-    backward pass runs under vmap.
+    therefore connects the gradients with `inputs`, the op's and the gradients of its outputs, through a
+    function whose backward pass raises an error. `op`: its name. RuntimeError: the backward pass runs under
+    vmap.
     """
     recorded = torch.is_grad_enabled()
     try:
@@ -56,13 +54,9 @@ def linear_map(
     forward: Callable[..., tuple[Tensor, ...]],
     adjoint: Adjoint,
     inputs: Sequence[Tensor | None],
-    saved: Sequence[Tensor] = (),
 ) -> tuple[Tensor, ...]:
-    """Apply a linear map to tensors, with the gradient that its adjoint gives.
-
-    Autograd records nothing of `forward`. `saved`: tensors without gradients for `adjoint`.
-    """
-    outputs: tuple[Tensor, ...] = _LinearMap.apply(forward, adjoint, saved, *inputs)  # type: ignore[no-untyped-call]
+    """Apply a linear map, of which autograd records nothing, with the gradient that its adjoint gives."""
+    outputs: tuple[Tensor, ...] = _LinearMap.apply(forward, adjoint, *inputs)  # type: ignore[no-untyped-call]
     return outputs
 
 
@@ -74,26 +68,19 @@ class _LinearMap(torch.autograd.Function):
         ctx: Any,
         forward: Callable[..., tuple[Tensor, ...]],
         adjoint: Adjoint,
-        saved: Sequence[Tensor],
         *inputs: Tensor | None,
     ) -> tuple[Tensor, ...]:
         ctx.adjoint = adjoint
-        ctx.save_for_backward(*saved)
         ctx.set_materialize_grads(False)
         return forward(*inputs)
 
     @staticmethod
     def backward(ctx: Any, *v_outputs: Tensor | None) -> Any:
-        return None, None, None, *ctx.adjoint(ctx.saved_tensors, ctx.needs_input_grad[3:], v_outputs)
+        return None, None, *ctx.adjoint(ctx.needs_input_grad[2:], v_outputs)
 
 
-def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
-    """Return a sparse tensor of a table in which only the given rows are not zero.
-
-    `ids`: int32 or int64 [U], ascending, each once. `values`: the rows, [U, ...]. `shape`: shape of the
-    table.
-    """
-    indices = ids.long()[None]
+def sparse_rows(indices: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
+    """Return a sparse table of which only some rows, int64 [1, U], ascending, each once, are not zero."""
     if indices.shape[1] == 0:
         # Torch adds to an empty gradient in place, and would change the indices of all that share them.
         indices = indices.clone()
@@ -105,43 +92,67 @@ def sparse_rows(ids: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
 def full_gradients(
     ids: Tensor, gradients: Sequence[Tensor | None], shapes: Sequence[torch.Size], sparse: Sequence[bool]
 ) -> list[Tensor | None]:
-    """Return the gradients of whole parameters from those of their rows, as sparse or dense tensors.
-
-    `ids`: int32 or int64 [U], ascending, each once. `gradients`: [U, ...] of each parameter; None: it needs
-    none. `shapes`: [N, ...] of each. `sparse`: which of the results are sparse.
-    """
+    """Return the gradients of parameters from those of their rows `ids` [U], each once; None: not needed."""
     ids = ids.long()
-    return [
-        None
-        if gradient is None
-        else sparse_rows(ids, gradient, shape)
-        if is_sparse
-        else gradient.new_zeros(shape).index_copy_(0, ids, gradient)
-        for gradient, shape, is_sparse in zip(gradients, shapes, sparse, strict=True)
-    ]
+    indices = ids[None]
+
+    def full(gradient: Tensor, shape: torch.Size, is_sparse: bool) -> Tensor:
+        if is_sparse:
+            return sparse_rows(indices, gradient, shape)
+        return gradient.new_zeros(shape).index_copy_(0, ids, gradient)
+
+    every = zip(gradients, shapes, sparse, strict=True)
+    return [None if v is None else full(v, shape, is_sparse) for v, shape, is_sparse in every]
+
+
+def rows_of_tables(
+    tables: Sequence[Tensor],  # [N, ...] each: four, and parts [N, L, 3] of the SH, if there are any
+    ids: Tensor,  # int64 [U], ascending, each once
+    sparse: bool,  # whether the gradients of the tables are sparse
+    found: Sequence[Tensor] | None = None,  # the result, if it is already known
+) -> tuple[Tensor, ...]:
+    """Return the rows `ids` of tables, [U, ...] each, with the parts of the SH joined to one.
+
+    The tables are not saved: their gradients do not depend on their values, which may change.
+    """
+    shapes, lengths = [table.shape for table in tables], [part.shape[1] for part in tables[4:]]
+
+    def gather(*tables: Tensor) -> tuple[Tensor, ...]:
+        if found is not None:
+            return tuple(found)
+        rows = [table.index_select(0, ids) for table in tables]
+        return (*rows[:4], *([torch.cat(rows[4:], dim=1)] if lengths else []))
+
+    def spread(needed: Sequence[bool], v: Sequence[Tensor | None]) -> list[Tensor | None]:
+        gradients = list(v)
+        if len(lengths) > 1 and v[4] is not None:
+            # Autograd would copy a gradient that is not contiguous, and its indices with it. Torch adds to an
+            # empty sparse gradient in place, so parts share no memory.
+            parts = v[4].split_with_sizes(lengths, 1)
+            gradients[4:] = [part.clone(memory_format=torch.contiguous_format) for part in parts]
+        elif lengths:
+            gradients[4:] = [v[4]] * len(lengths)
+        wanted = [gradient if need else None for gradient, need in zip(gradients, needed, strict=True)]
+        return full_gradients(ids, wanted, shapes, [sparse] * len(shapes))
+
+    return linear_map(gather, spread, tables)
 
 
 def distinct_rows(table: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the rows int64 [1, U], each once, and the values [U, ...] of a sparse tensor.
-
-    `table`: a tensor whose only sparse dimension is the first.
-    """
+    """Return rows int64 [1, U], each once, and values [U, ...] of a tensor with one sparse dimension."""
     if not table.is_coalesced():
         table = table.coalesce()
     return raw_indices(table), raw_values(table)
 
 
 def of_shape(table: Tensor, shape: Sequence[int]) -> Tensor:
-    """Return a table with rows of another shape and as many values, whose gradient may be sparse.
+    """Return a table [N, ...] with rows of another shape, (N, ...), whose gradient may be sparse."""
 
-    `table`: [N, ...]. `shape`: (N, ...).
-    """
-
-    def back(_saved: Any, _needed: Any, v: Sequence[Tensor | None]) -> list[Tensor | None]:
+    def back(_needed: Any, v: Sequence[Tensor | None]) -> list[Tensor | None]:
         if v[0] is None or not v[0].is_sparse:
             return [None if v[0] is None else v[0].reshape(table.shape)]
         values = raw_values(v[0])
-        return [sparse_rows(raw_indices(v[0])[0], values.reshape(len(values), *table.shape[1:]), table.shape)]
+        return [sparse_rows(raw_indices(v[0]), values.reshape(len(values), *table.shape[1:]), table.shape)]
 
     (reshaped,) = linear_map(lambda rows: (rows.reshape(tuple(shape)),), back, [table])
     return reshaped

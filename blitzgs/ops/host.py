@@ -18,8 +18,7 @@ class PinnedNumbers(NamedTuple):
     """A piece of pinned memory of the host, into which the device writes numbers, with an event."""
 
     memory: Tensor  # [n] numbers
-    # Event of one device; the user records it after the work that writes the memory.
-    written: torch.cuda.Event
+    written: torch.cuda.Event  # of one device; recorded by the user after the work that writes
     idle: list[PinnedNumbers]  # the pieces of this length, dtype and device that are not in use
 
     @classmethod

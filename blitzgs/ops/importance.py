@@ -11,9 +11,8 @@ from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
 
-# Units of a weight in 1, kContributionScale of csrc/importance/importance.h. The op `contributions` returns
-# sums of such integers, so that they do not depend on the order of addition, and the sums of disjoint ranges
-# of tiles add up to the sum of all tiles.
+# Units of a weight in 1, kContributionScale of csrc/importance/importance.h. Sums of such integers depend on
+# no order of addition, and those of disjoint ranges of tiles add up.
 UNITS = 1 << 32
 # How many times a weight is divided by the square root of its number of pixels, for each score rule.
 DIVISIONS = {"weight": 0, "root": 1, "density": 2}
@@ -24,40 +23,29 @@ class ViewSums(NamedTuple):
 
     score: Tensor  # int64 [N]
     seen: Tensor  # int32 [N], number of views in which the Gaussian is visible (radius > 0)
-    # int32 [N], number of views in which it counts (it is in the top 99 % of the view's weight).
-    counted: Tensor
+    counted: Tensor  # int32 [N], number of views in which it counts (is in the top 99 % of the weight)
     cull: Tensor  # int32 [N, words], bit v % 32 of word v / 32 set where it does not count in view v
 
 
 @torch.no_grad()
 def view_sums_(
-    sums: ViewSums,
+    sums: ViewSums,  # changed in place
+    # visible_ids int32 [U] and splat_offsets int32 [U + 1] (the Gaussians, each once, and the splats of
+    # each), camera_ids int32 [P], radii int32 [P, 2]
     splats: tuple[Tensor, Tensor, Tensor, Tensor],
-    weights: Tensor,
-    pixels: Tensor,
-    counts: Tensor,
-    columns: Sequence[int],
+    weights: Tensor,  # int64 [P], in units of 2^-32
+    pixels: Tensor,  # int32 [P]
+    counts: Tensor,  # bool [P], whether the Gaussian counts in the splat's view
+    columns: Sequence[int],  # the views' columns in the cull matrix
     *,
-    rule: str,
-    eps: float,
-    unit: float,
+    rule: str,  # score rule, a key of `DIVISIONS`
+    eps: float,  # added to the number of pixels
+    unit: float,  # unit of the score; division by a power of two is exact
 ) -> None:
     """Add the splats of at most 32 views to the sums.
 
     A splat adds ``round(w / (pixels + eps)^p / unit)`` to its Gaussian's score, where w is its weight (in
     units of 1) and p is 1 for "density" (BlitzGS, section 3.2), 1/2 for "root" and 0 for "weight".
-
-    Args:
-        sums: changed in place.
-        splats: visible_ids int32 [U] and splat_offsets int32 [U + 1] (the Gaussians, each once, and the
-            splats of each), camera_ids int32 [P], radii int32 [P, 2].
-        weights: int64 [P], in units of 2^-32.
-        pixels: int32 [P].
-        counts: bool [P], whether the Gaussian counts in the splat's view.
-        columns: the views' columns in the cull matrix.
-        rule: score rule, a key of `DIVISIONS`.
-        eps: added to the number of pixels.
-        unit: unit of the score; division by a power of two is exact.
     """
     torch.ops.blitzgs.view_sums_(
         list(sums), list(splats), weights, pixels, counts, list(columns), DIVISIONS[rule], eps, unit
@@ -69,8 +57,7 @@ class PixelSplats(NamedTuple):
 
     transmittances: Tensor  # [R], the share of light that passes all splats
     counts: Tensor  # int32 [R], the number of composited splats
-    # int32 [R], the last composited splat with a transmittance above 0.5 in front of it, -1 for none.
-    medians: Tensor
+    medians: Tensor  # int32 [R], the last composited splat with T above 0.5 in front of it, -1 for none
     ids: Tensor  # int32 [R, k], the splats of the largest alpha T, front to back; then -1
     weights: Tensor  # [R, k], their alpha T; then 0
 

@@ -74,12 +74,9 @@ def intersect(
         depths: sort keys [P], the z of each splat in its view.
         camera_ids: int32 [P], the view of each splat.
         ids: int64 [P], persistent ids that order splats of equal depth; None: their index orders them.
-        n_cameras: number of views B.
-        width: of every view, pixels.
-        height: of every view, pixels.
+        n_cameras, width, height: number of views B, and the size of each, pixels.
         tile_size: edge of a tile in pixels, 1 to 64.
-        tile_begin: first owned tile; tiles outside [tile_begin, tile_end) get empty lists.
-        tile_end: end of the owned tiles, -1 for all.
+        tile_begin, tile_end: the owned tiles, end -1 for all; others get empty lists.
         n_isects: an upper bound of the number of intersections if known (the sum of ``tiles_touched``),
             -1 to have them counted. On CUDA the check of this bound waits for the device.
         n_splats: int64 [1] on the device of the splats: only the first ``n_splats`` of the P are valid, the

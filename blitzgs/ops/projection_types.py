@@ -66,11 +66,7 @@ class ProjectedSplats(NamedTuple):
 
 
 def splats_of(allocated: Sequence[Tensor], sizes: Sizes, counts: Tensor | None = None) -> ProjectedSplats:
-    """Return the valid splats of columns that were allocated with more capacity.
-
-    `allocated`: a `ProjectedSplats`; its `counts` are not read. `sizes`: numbers of valid Gaussians and
-    splats; `blocks` is not read. `counts`: the first three of `sizes` as a CPU tensor, if there is one.
-    """
+    """Return the valid splats of columns with more capacity; `counts`: of `sizes`, if there is a tensor."""
     if allocated[0].shape[0] > sizes.splats or allocated[2].shape[0] > sizes.visible:
         visible, splats = sizes[:2]
         allocated = first_rows(allocated[:12], [splats, splats, visible, visible + 1, *[splats] * 8])
@@ -80,11 +76,7 @@ def splats_of(allocated: Sequence[Tensor], sizes: Sizes, counts: Tensor | None =
 
 
 def first_rows(columns: Sequence[Tensor], lengths: Sequence[int]) -> list[Tensor]:
-    """Return the first rows of columns, at most as many as they have.
-
-    Autograd does not see that these are views: a Function may return views, but its caller could not change
-    them in place.
-    """
+    """Return the first rows of columns, as views that autograd does not know: callers may change them."""
     return torch.ops.blitzgs.first_rows(columns, lengths)
 
 
@@ -123,17 +115,6 @@ class ProjectionOptions(NamedTuple):
 N_OPTIONS = len(ProjectionOptions._fields)
 
 
-class WeightedViews(NamedTuple):
-    """B views as the backward ops take them, in this order: cameras, and weights of regularisers."""
-
-    viewmats: Tensor  # [B, 4, 4], world to camera
-    Ks: Tensor  # [B, 3, 3], intrinsics in px
-    # Weight per view, [B], of the smallest axis of each Gaussian visible in it; None: no such term.
-    scale_reg: Tensor | None = None
-    # The same of the opacity (without the compensation of antialiased splats).
-    opacity_reg: Tensor | None = None
-
-
 class ProjectionInputs(NamedTuple):
     """The inputs of a projection."""
 
@@ -143,10 +124,8 @@ class ProjectionInputs(NamedTuple):
     # The Gaussians to consider: the fields of `ActiveRows` (ids, views, length, blocks), of which only ids
     # are required. Empty: all Gaussians in all views.
     active: Sequence[Tensor | None] = ()
-    # int64 [N], persistent ids of the Gaussians; None: do not return the splats' ids.
-    ids: Tensor | None = None
-    # uint8 [N], octree levels, if opacities fade with them (`ProjectionOptions.fade`); else None.
-    level: Tensor | None = None
+    ids: Tensor | None = None  # int64 [N], persistent; None: the splats get no ids
+    level: Tensor | None = None  # uint8 [N], octree levels, if opacities fade with them (`fade`)
 
     @property
     def n_views(self) -> int:
@@ -167,24 +146,18 @@ class ProjectionInputs(NamedTuple):
         numbers. None: wait, and allocate exactly as many as there are. `rank_tiles`: for each rank the
         [begin, end) of the tiles that it composites, in ascending order.
         """
+        room = (None, None) if capacity is None else capacity[:2]
         *columns, splat_ids, totals = torch.ops.blitzgs.project_fwd(
-            self.gaussians,
-            *self.cameras,
-            *self.active_arguments,
-            self.ids,
-            self.level,
-            *self.options,
-            [tile for tiles in rank_tiles for tile in tiles],
-            *((None, None) if capacity is None else capacity[:2]),
-        )
+            self.gaussians, *self.cameras, *self.active_arguments, self.ids, self.level, *self.options,
+            [tile for tiles in rank_tiles for tile in tiles], *room,
+        )  # fmt: skip
         return ProjectionOutputs(ProjectedSplats._make((*columns, None)), splat_ids, totals)
 
 
 class ProjectionOutputs(NamedTuple):
     """What `ProjectionInputs.project` returns."""
 
-    # Columns as long as the given capacity, if there was one; `counts` is None. The contents are undefined if
-    # the capacity was too small.
+    # as long as the given capacity, if any, without `counts`; undefined if the capacity was too small
     splats: ProjectedSplats
     ids: Tensor  # int64 [P], persistent ids of the splats' Gaussians; [0] if `ProjectionInputs.ids` is None
     # int64 [VIEW_TOTALS + B + 2 M], on the device, right even if the capacity was too small: `Sizes` (with an

@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rasterisation: front-to-back alpha compositing of splats, tile by tile, and its gradient."""
+"""Rasterisation: front-to-back alpha compositing of splats, tile by tile, and its gradient.
+
+Also the gradients of splats, in the two layouts in which compositing hands them to the projection.
+"""
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -13,9 +18,13 @@ from torch import Tensor
 from blitzgs._library import below_autograd
 from blitzgs.ops.derivatives import first_only
 from blitzgs.ops.intersect import TileGrid, pixels_of_tiles
-from blitzgs.ops.splat_gradients import GradientBuffer, RasterizeSaved, gradient_columns
 from blitzgs.util.errors import check_tensors
 
+# Where the parts of a splat gradient begin in its floats (csrc/common/kernel.h), and how many these are.
+_MEAN2D, _CONIC, _OPACITY, _COLOR, _MEAN2D_ABS, SPLAT_GRADIENT = torch.ops.blitzgs.splat_gradient_layout()
+
+# The attribute by which a column carries the table that it is a part of, and its number among the columns.
+_TABLE = "_blitzgs_gradient_table"
 # For alphas = 1 - transmittances. With the number 1, torch would first make a tensor of it, which takes 5 us
 # of the host's time. A tensor without dimensions on the CPU combines with tensors of any device and dtype.
 _ONE = torch.ones((), device="cpu")
@@ -73,13 +82,9 @@ def rasterize(
         colors: [P, D], D from 1 to 4096.
         isect_splats: int32 [I], from `blitzgs.ops.intersect.intersect`.
         tile_offsets: int64 [B * T + 1], from the same call.
-        n_cameras: number of views B.
-        width: of every view, pixels.
-        height: of every view, pixels.
-        tile_size: edge of a tile in pixels, as given to ``intersect``.
+        n_cameras, width, height, tile_size, tile_begin, tile_end: as given to ``intersect``; the pixels of
+            tiles outside [tile_begin, tile_end) are zero.
         backgrounds: [B, D], or None for black.
-        tile_begin: first owned tile; pixels of tiles outside [tile_begin, tile_end) are zero.
-        tile_end: end of the owned tiles, -1 for all.
         store_absgrad: the backward pass calls it with the sum over pixels of the absolute gradient of
             means2d, per axis, [P, 2], whichever gradients it computes.
         composited: the result of the op `rasterize_fwd` for these arguments and alphas, if they are already
@@ -124,6 +129,102 @@ def rasterize(
         end = sys.maxsize if tile_end < 0 else tile_end
         alphas = alphas * pixels_of_tiles(n_cameras, width, height, tile_size, tile_begin, end, alphas.device)
     return renders, alphas
+
+
+def gradient_columns(table: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """View a table of splat gradients as columns, from which `gradient_table_of` takes the table.
+
+    `table`: [P, 12], as the op `rasterize_bwd` fills it. Returns gradients of means2d [P, 2], conics [P, 3],
+    opacities [P] and colors [P, 3].
+    """
+    columns = (
+        table[:, _MEAN2D : _MEAN2D + 2],
+        table[:, _CONIC : _CONIC + 3],
+        table[:, _OPACITY],
+        table[:, _COLOR : _COLOR + 3],
+    )
+    for number, column in enumerate(columns):
+        setattr(column, _TABLE, (table, number))
+    return columns
+
+
+def gradient_table_of(columns: Sequence[Tensor | None]) -> Tensor | None:
+    """Return the table of which `columns` are the `gradient_columns`; None if they are not of one table.
+
+    Autograd hands these columns on as they are, unless something else has a part in a gradient (a second use
+    of the splats, a hook): it is then another tensor, which carries no table.
+    """
+    table, _ = getattr(columns[0], _TABLE, (None, 0))
+    parts = (getattr(column, _TABLE, (None, 0)) for column in columns)
+    return table if all(of is table and i == n for i, (of, n) in enumerate(parts)) else None
+
+
+class SplatGradients(NamedTuple):
+    """Gradients of P splats in one of two forms."""
+
+    # v_means2d [P, 2], v_conics [P, 3], v_opacities [P], v_colors [P, 3]; or (CUDA) one table [P, 12]
+    parts: Sequence[Tensor]
+
+    @property
+    def means2d(self) -> Tensor:
+        """The gradient of means2d, [P, 2] per pixel."""
+        first = self.parts[0]
+        return first[:, _MEAN2D : _MEAN2D + 2] if len(self.parts) == 1 else first
+
+    def side_by_side(self) -> Tensor:
+        """Return all columns as one [P, 9]."""
+        flat = [column.reshape(len(column), math.prod(column.shape[1:])) for column in self._columns()]
+        return torch.cat(flat, 1)
+
+    def sum_returned(self, values: Sequence[Tensor], places: Tensor, splats: int) -> SplatGradients:
+        """Return the gradients of P own splats, summed over the ranks in their order; zero if sent nowhere.
+
+        `values`: [n, F] of each rank, the rows of its `side_by_side` for this rank's splats. `places`: from
+        `blitzgs.ops.exchange.scatter_splats`.
+        """
+        columns = self._columns()
+        widths = [math.prod(column.shape[1:]) for column in columns]
+        sums = torch.ops.blitzgs.sum_splats(values, places, splats, widths)
+        return SplatGradients(
+            [total.reshape(-1, *like.shape[1:]) for total, like in zip(sums, columns, strict=True)]
+        )
+
+    def _columns(self) -> Sequence[Tensor]:
+        """Return the four columns."""
+        return gradient_columns(self.parts[0]) if len(self.parts) == 1 else self.parts
+
+
+class RasterizeSaved(NamedTuple):
+    """What a forward pass saves for the ops of the backward pass, in the groups that these take."""
+
+    splats: list[Tensor]  # means2d [P, 2], conics [P, 3], splat_opacities [P], colors [P, D]
+    backgrounds: Tensor | None  # [B, D]; None: black
+    # isect_splats, int32 [I], by tile, front to back; tile_offsets, int64 [B T + 1], where each begins
+    lists: list[Tensor]
+    # transmittances [B, H, W]; last_ids, int32 [B, H, W], where each pixel's list ended; packed_splats and
+    # tile_order, in layouts that only the kernels of the backend read.
+    composited: list[Tensor]
+
+
+@dataclass
+class GradientBuffer:
+    """Memory in which the CUDA backward pass sums the gradients of splats; the forward pass has zeroed it.
+
+    It serves one backward pass; each later one gets other memory.
+    """
+
+    zeros: Tensor | None  # [P or more, 12], the last output of `rasterize_fwd`; [0, 12] or None: none
+    # zeroes memory for later backward passes; without it, or if it returns None, some is allocated
+    others: Callable[[], Tensor | None] | None = None
+
+    def take(self, means2d: Tensor) -> Tensor:
+        """Return zeros [P, 12] for the P splats."""
+        zeros, self.zeros = self.zeros, None
+        count = means2d.shape[0]
+        if zeros is not None and zeros.shape[0] >= count:
+            return zeros if zeros.shape[0] == count else zeros[:count]
+        others = None if self.others is None else self.others()
+        return means2d.new_zeros(count, SPLAT_GRADIENT) if others is None else others
 
 
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:

@@ -21,15 +21,11 @@ _ANGLES = 4096
 class Lenses(NamedTuple):
     """What B views have besides viewmats and intrinsics."""
 
-    # [B, 13]: OpenCV's k1 to k6, p1, p2, s1 to s4 and the largest angle of a fisheye, radians, see
-    # `largest_angles`.
+    # [B, 13]: OpenCV's k1 to k6, p1, p2, s1 to s4, largest angle of a fisheye (`largest_angles`)
     lenses: Tensor
-    # [B, 4, 4], poses at the end of the frame; viewmats then are those at its begin. None: with a global
-    # shutter.
-    viewmats_rs: Tensor | None = None
+    viewmats_rs: Tensor | None = None  # [B, 4, 4], poses at the end of a rolling shutter's frame
     fisheye: bool = False  # whether k1 to k4 are those of OpenCV's fisheye, and the others unused
-    # What is exposed first: 0 the top row, 1 the left column, 2 the bottom row, 3 the right column, 4 all at
-    # once.
+    # what is exposed first: 0 the top row, 1 the left column, 2 the bottom row, 3 the right one, 4 all
     shutter: int = GLOBAL_SHUTTER
     # Alpha, beta, kappa; how many image sizes beside the image a sigma point is valid; and whether all (1) or
     # some (0) of the points of a Gaussian have to be valid.
@@ -56,22 +52,17 @@ def largest_angles(radial: Tensor) -> Tensor:
     return angles.squeeze(-1).to(radial.dtype)
 
 
-def project_unscented(inputs: ProjectionInputs, lenses: Lenses) -> ProjectedSplats:
+def project_unscented(
+    inputs: ProjectionInputs,  # of the projection; `active`, `ids`, `level` and `options.fade` are not read
+    lenses: Lenses,  # of its views
+) -> ProjectedSplats:
     """Project Gaussians by the unscented transform (3DGUT, Wu et al. 2025; csrc/project/unscented.h).
 
     A Gaussian has a splat if some of its sigma points (all, if so asked) are valid, and else by the rules of
-    `blitzgs.ops.project.project`. Differentiable, once, in the Gaussians; viewmats get no gradient.
-    Every Gaussian is projected into every view, and the host waits for the number of splats.
-
-    Args:
-        inputs: of the projection; `active`, `ids`, `level` and `options.fade` are not read.
-        lenses: of its views.
-
-    Returns:
-        Splats as `blitzgs.ops.project.project` returns them.
-
-    Raises:
-        RuntimeError: an argument has a wrong shape, dtype or value; the message names it.
+    `blitzgs.ops.project.project`. Differentiable, once, in the Gaussians; viewmats get no gradient. Every
+    Gaussian is projected into every view, and the host waits for the number of splats. Returns splats as
+    `blitzgs.ops.project.project` returns them. RuntimeError: an argument has a wrong shape, dtype or value;
+    the message names it.
     """
     given = (inputs.gaussians, *inputs.cameras, *lenses, *inputs.options[: N_OPTIONS - 1])
     seen = torch.ops.blitzgs.unscented_visible(*given)

@@ -15,7 +15,6 @@ from blitzgs.ops.derivatives import KeptMarks, distinct_rows
 from blitzgs.ops.lazy_adam import GrowingSchedule
 from blitzgs.optim.lazy_adam_checks import (
     MOMENTS,
-    check_chosen,
     check_group,
     check_listed,
     check_mask,
@@ -24,6 +23,7 @@ from blitzgs.optim.lazy_adam_checks import (
     check_param,
     check_rows,
     check_saved,
+    check_tensor,
     groups_by_name,
 )
 from blitzgs.util.errors import warn
@@ -202,7 +202,9 @@ class LazyAdam(torch.optim.Optimizer):
         if isinstance(params, Tensor):
             params = [params]
         given = list(params or ())
-        check_chosen(given)
+        for param in given:
+            if not isinstance(param, Tensor):  # as a name
+                check_tensor("catch_up: params", param)
         chosen = None if params is None else set(map(id, given))
         for group, index, param in self._places():
             if (chosen is not None and id(param) not in chosen) or _STEPS[0] not in self.state.get(param, ()):
@@ -299,11 +301,8 @@ class LazyAdam(torch.optim.Optimizer):
 
     def _select(self, rows: Tensor) -> dict[str, Parameter]:
         """Make the parameters of some of their rows, int64 [N']."""
-        return self._renew(
-            groups_by_name(self.param_groups),
-            lambda _, old: old.index_select(0, rows),
-            lambda old: old.index_select(0, rows),
-        )
+        named = groups_by_name(self.param_groups)
+        return self._renew(named, lambda _, old: old[rows], lambda old: old[rows])
 
     @torch.no_grad()
     def _renew(

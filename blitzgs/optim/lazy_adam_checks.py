@@ -15,11 +15,7 @@ Groups = Mapping[str, dict[str, Any]]  # parameter groups of one parameter each,
 
 
 def check_group(group: dict[str, Any]) -> None:
-    """Check the parameters and options of a group.
-
-    ValueError: a parameter has no rows, or an option is outside its range, or is one of `torch.optim.Adam`
-    that is not supported.
-    """
+    """Check the parameters and options of a group (ValueError: one is wrong or not supported)."""
     if any(isinstance(param, Tensor) and param.dim() == 0 for param in group["params"]):
         raise ValueError("LazyAdam: a parameter must have rows, [N, ...], got a single number; use Adam")
     beta1, beta2 = group["betas"]
@@ -34,10 +30,7 @@ def check_group(group: dict[str, Any]) -> None:
 
 
 def check_param(param: Tensor) -> None:
-    """Check that a parameter has a form that the op takes.
-
-    ValueError: it has another dtype, or is not contiguous.
-    """
+    """Check that a parameter has a form that the op takes (ValueError: it has not)."""
     if param.dtype not in (torch.float32, torch.float64):
         raise ValueError(
             f"LazyAdam: parameters must be float32 or float64, one of shape {list(param.shape)} is "
@@ -57,18 +50,9 @@ def check_rows(param: Tensor, state: Mapping[str, Any]) -> None:
             )
 
 
-def check_chosen(params: Sequence[Tensor]) -> None:
-    """Check the parameters that `catch_up` takes (TypeError: one is not a tensor, as a name)."""
-    for param in params:
-        _check_tensor("catch_up: params", param)
-
-
 def check_listed(rows: Tensor, count: Tensor | None, param: Tensor) -> None:
-    """Check the rows that `catch_up` takes, on the CPU (on CUDA, the host would wait for them).
-
-    TypeError, ValueError: as `LazyAdam.catch_up`.
-    """
-    _check_tensor("catch_up: rows", rows)
+    """Check the rows that `catch_up` takes, on the CPU (on CUDA, the host would wait for them)."""
+    check_tensor("catch_up: rows", rows)
     if rows.is_cpu:
         listed = rows if count is None else rows[: int(count)]
         low, high = map(int, torch.aminmax(listed)) if len(listed) > 0 else (0, -1)
@@ -78,11 +62,7 @@ def check_listed(rows: Tensor, count: Tensor | None, param: Tensor) -> None:
 
 
 def check_saved(saved: Mapping[str, Any], params: Sequence[Tensor]) -> None:
-    """Check the state that `load_state_dict` takes.
-
-    `params`: all parameters; `torch.optim.Optimizer` checks their number. ValueError: as
-    `LazyAdam.load_state_dict`.
-    """
+    """Check the state that `load_state_dict` takes, of all parameters; torch checks their number."""
     for group in saved["param_groups"]:
         if missing := {"lr", "betas", "eps"} - group.keys():
             raise ValueError(
@@ -117,15 +97,12 @@ def groups_by_name(groups: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]
 
 
 def check_new_rows(rows: Mapping[str, Tensor], named: Groups) -> int:
-    """Check the rows that `append` takes; return their number.
-
-    TypeError, ValueError: as `LazyAdam.append`.
-    """
+    """Check the rows that `append` takes; return their number."""
     if rows.keys() != named.keys():
         raise ValueError(f"LazyAdam.append: rows for {sorted(named)} are needed, got {sorted(rows)}")
     for name, group in named.items():
         new, old = rows[name], group["params"][0]
-        _check_tensor(f"append: new rows of {name}", new)
+        check_tensor(f"append: new rows of {name}", new)
         if new.dim() == 0 or new.shape[1:] != old.shape[1:]:
             wanted = ", ".join(("M", *map(str, old.shape[1:])))
             raise ValueError(f"LazyAdam.append: new rows of {name} must be [{wanted}], got {list(new.shape)}")
@@ -136,8 +113,8 @@ def check_new_rows(rows: Mapping[str, Tensor], named: Groups) -> int:
 
 
 def check_mask(mask: Tensor, named: Groups) -> None:
-    """Check the mask that `keep` takes (TypeError, ValueError: as `LazyAdam.keep`)."""
-    _check_tensor("keep: mask", mask)
+    """Check the mask that `keep` takes."""
+    check_tensor("keep: mask", mask)
     if mask.dtype != torch.bool:
         raise ValueError(f"LazyAdam.keep: mask must be bool, got {mask.dtype}")
     for name, group in named.items():
@@ -151,8 +128,8 @@ def check_mask(mask: Tensor, named: Groups) -> None:
 
 
 def check_order(order: Tensor, named: Groups) -> None:
-    """Check the order that `permute` takes (TypeError, ValueError: as `LazyAdam.permute`)."""
-    _check_tensor("permute: order", order)
+    """Check the order that `permute` takes."""
+    check_tensor("permute: order", order)
     if order.dtype != torch.int64 or order.dim() != 1:
         raise ValueError(
             f"LazyAdam.permute: order must be int64 [N'], the old rows, got {order.dtype} "
@@ -177,7 +154,8 @@ def check_order(order: Tensor, named: Groups) -> None:
         )
 
 
-def _check_tensor(argument: str, value: object) -> None:
+def check_tensor(argument: str, value: object) -> None:
+    """Check that an argument of a method is a tensor (TypeError: it is not)."""
     if not isinstance(value, Tensor):
         raise TypeError(f"LazyAdam.{argument} must be a torch.Tensor, got {type(value).__name__}")
 

@@ -13,14 +13,14 @@ from blitzgs.config.schedule import Schedule
 from blitzgs.frame.render import Frame
 from blitzgs.ops.blocks import put_rows_, take_rows
 from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_, project_bwd_step_
-from blitzgs.ops.projection_types import WeightedViews
-from blitzgs.ops.splat_gradients import SplatGradients
+from blitzgs.ops.rasterize import SplatGradients
 from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
 
 # Adam's constants for one view a step.
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
 # Rows with 48 coefficients are about 200 MB together.
 _PART = 1 << 18
+_GROUPS = (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)
 
 
 class TableAdam:
@@ -28,8 +28,7 @@ class TableAdam:
 
     The batch scaling is that of Grendel-GS (Zhao et al. 2024). A step does not touch rows that it does not
     update; the columns `last_step` and `moment_step` note how far each row is current. `catch_up` must be
-    called before the parameters of such rows are read. Use this class for a `GaussianTable` and a `Schedule`
-    that is known in advance, as the trainer does, and `blitzgs.optim.LazyAdam` in a loop of your own.
+    called before the parameters of such rows are read. In a loop of your own, use `blitzgs.optim.LazyAdam`.
     """
 
     def __init__(self, config: OptimiserConfig, schedule: Schedule, extent: float, device: object) -> None:
@@ -61,10 +60,7 @@ class TableAdam:
     def catch_up(
         self, table: GaussianTable, ids: Tensor | None, step: int, count: Tensor | None = None
     ) -> None:
-        """Apply the pending steps up to `step` to the rows `ids` (int32 or int64 [A]; None: all).
-
-        ``count``, int32 [1]: only the first `count` of `ids` are rows.
-        """
+        """Apply the pending steps up to `step` to rows, int32 or int64 [A], or the first `count` of them."""
         lazy_adam_catch_up_(_state_of(table), self.schedule, step, ids, count)
 
     def pending(self, table: GaussianTable, step: int) -> Pending:
@@ -79,30 +75,21 @@ class TableAdam:
 
     def step(
         self,
-        table: GaussianTable,
+        table: GaussianTable,  # the one that was rendered, unchanged since; visible rows are current
         frame: Frame,
-        gradients: SplatGradients,
+        gradients: SplatGradients,  # of the frame's splats, from `frame.backward_splats`
+        # `scale_reg`, `opacity_reg`: weights per view, [B], of the smallest axis and of the opacity of each
+        # Gaussian visible in it; None: no such term
         scale_reg: Tensor | None,
         opacity_reg: Tensor | None,
         step: int,
     ) -> None:
-        """Take step number `step` (from 1) for the Gaussians that a frame shows.
-
-        `table`: the one that was rendered, unchanged since; its visible rows must be current up to
-        `step` - 1. `gradients`: of the frame's splats, from `frame.backward_splats`. `scale_reg`,
-        `opacity_reg`: weights per view, [B], of the smallest axis and of the opacity of each Gaussian visible
-        in it; None: no such term.
-        """
+        """Take step number `step` (from 1) for the Gaussians that a frame shows."""
+        views, options = frame.views, frame.options
         project_bwd_step_(
-            _state_of(table),
-            self.schedule,
-            step,
-            WeightedViews(frame.views.viewmats, frame.views.Ks, scale_reg, opacity_reg),
-            frame.projected,
-            frame.options.projection(frame.views),
-            gradients,
-            table["level"] if frame.options.fade else None,
-        )
+            _state_of(table), self.schedule, step, (views.viewmats, views.Ks, scale_reg, opacity_reg),
+            frame.projected, options.projection(views), gradients, table["level"] if options.fade else None,
+        )  # fmt: skip
 
 
 class Pending:
@@ -142,9 +129,7 @@ class Pending:
         names = (*PARAMETERS, *EXP_AVGS, *EXP_AVG_SQS, "last_step", "moment_step")
         taken = take_rows([table[name] for name in names], rows)
         part = {name: column.to(self._device) for name, column in zip(names, taken, strict=True)}
-        params, exp_avgs, exp_avg_sqs = (
-            [part[name] for name in group] for group in (PARAMETERS, EXP_AVGS, EXP_AVG_SQS)
-        )
+        params, exp_avgs, exp_avg_sqs = ([part[name] for name in group] for group in _GROUPS)
         state = AdamState(params, exp_avgs, exp_avg_sqs, part["last_step"], part["moment_step"])
         lazy_adam_catch_up_(state, self._optimiser.schedule, self._step)
         names = (*PARAMETERS, "last_step")

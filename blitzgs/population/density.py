@@ -39,18 +39,13 @@ class DensityRules:
     """The thresholds of a density event, with lengths in the unit of the means."""
 
     grad_threshold: float  # mean 2D-mean gradient norm (half-image units) from which a Gaussian is densified
-    # Gaussians with a largest axis up to this are cloned, larger ones split; 0: all are split.
-    clone_scale: float
+    clone_scale: float  # up to this largest axis Gaussians are cloned, others split; 0: all are split
     min_opacity: float  # Gaussians of lower opacity are pruned
-    # Pixels; Gaussians with a larger radius since the last event are pruned. None: none are.
-    max_screen_radius: float | None = None
-    # Gaussians with a larger axis are pruned. None: none are.
-    max_scale: float | None = None
-    # Limit of the population after the event. None: no limit.
-    max_gaussians: int | None = None
-    # A Gaussian is judged when it has at least this many gradients; with fewer, its statistics are kept for
-    # the next event. A mean of few gradients is noisy, and the largest of many noisy means would make
-    # Gaussians without need.
+    max_screen_radius: float | None = None  # pixels, since the last event; larger ones are pruned
+    max_scale: float | None = None  # Gaussians with a larger axis are pruned; None: none are
+    max_gaussians: int | None = None  # limit of the population after the event; None: no limit
+    # With fewer gradients a Gaussian is not judged, and its statistics are kept for the next event: the
+    # largest of many noisy means would make Gaussians without need.
     min_observations: int = 1
 
 
@@ -67,40 +62,27 @@ class DensityReport:
 
 
 def densify(
-    table: GaussianTable,
+    table: GaussianTable,  # changed in place; the rows are those of `placement.place`
     rules: DensityRules,
     *,
-    time: int,
-    step: int,
+    time: int,  # time of the event, in images
+    step: int,  # the latest optimiser step; new rows are current up to it
     seed: int,
-    level_count: int,
-    ranks: Ranks,
-    extent: float = 1.0,
-    veto: Veto | None = None,
-    lineage: Lineage | None = None,
-    pending: Pending | None = None,
+    level_count: int,  # number of octree levels K; levels of children stay below it
+    ranks: Ranks,  # the job, whose tables together are the population; every rank calls this
+    extent: float = 1.0,  # of the scene, in the unit of the means, for the candidates' features
+    veto: Veto | None = None,  # returns which candidates are withheld; None: none are
+    lineage: Lineage | None = None,  # logs births and deaths, or None
+    pending: Pending | None = None,  # pending steps of the table, which candidates take; None: none
 ) -> DensityReport:
     """Run one density event, and reset the statistics that it used.
 
     A candidate is a Gaussian with at least `min_observations` gradients whose mean, `grad_sum / grad_count`,
-    reaches the threshold. A small candidate gets a copy. A large one is replaced by two children that are
-    drawn from it and are 1.6 times smaller (Kerbl et al. 2023, section 5). A copy has its parent's octree
-    level, a child of a split the next one. Both have the parent's phi and cull row, and moments of zero.
-    Their ids and random positions depend only on the parent's id, `time` and the child's slot, so the result
-    does not depend on the order of the rows.
-
-    Pruning applies to old and new rows; a new row has no screen radius yet.
-
-    Args:
-        table: changed in place; the rows are those of `placement.place`.
-        time: time of the event, in images.
-        step: the latest optimiser step; new rows are current up to it.
-        level_count: number of octree levels K; levels of children stay below it.
-        ranks: the job, whose tables together are the population; every rank calls this.
-        extent: extent of the scene, in the unit of the means; only used for the candidates' features.
-        veto: returns which candidates are withheld; None: none are.
-        lineage: logs births and deaths, or None.
-        pending: the table's pending steps, of which the candidates take theirs; None: there are none.
+    reaches the threshold. A small candidate gets a copy; a large one is replaced by two children that are
+    drawn from it and are 1.6 times smaller (Kerbl et al. 2023, section 5), one octree level finer. New rows
+    have the parent's phi and cull row, and moments of zero. Ids and random positions depend only on the
+    parent's id, `time` and the child's slot. Pruning applies to old and new rows; a new row has no screen
+    radius yet.
     """
     gradient = table["grad_sum"] / table["grad_count"].clamp(min=1)
     candidates = (gradient >= rules.grad_threshold) & (table["grad_count"] >= rules.min_observations)
@@ -138,13 +120,8 @@ def densify(
         died = torch.nonzero_static(causes, size=n_died).squeeze(1)
         lineage.died(torch.cat((table["id"], new["id"]))[died], causes[died], time, step)
     grown = len(clones) + len(splits)
-    report = DensityReport(
-        cloned=len(clones),
-        split=len(splits),
-        pruned=grown + len(gone) - len(born),
-        held_back=int(wanted) - grown - vetoed,
-        vetoed=vetoed,
-    )
+    pruned, held_back = grown + len(gone) - len(born), int(wanted) - grown - vetoed
+    report = DensityReport(len(clones), len(splits), pruned, held_back, vetoed)
     if len(born) < len(parents):
         parents, new = parents[born], {name: column[born] for name, column in new.items()}
     table.replace(place(len(table), gone, parents, new["means"]), new, most_rows(rules, ranks))
@@ -160,8 +137,6 @@ def cap_opacities(table: GaussianTable, opacity: float) -> None:
     """Cap the opacities of all rows and set the moments of all opacities to zero; no step may be pending.
 
     This is the opacity reset of 3DGS (Kerbl et al. 2023, section 5.2).
-
-    `table`: changed in place. `opacity`: the cap, in (0, 1).
     """
     table["opacities"].clamp_(max=opacity_logit(opacity))
     table["exp_avg.opacities"].zero_()
@@ -193,16 +168,10 @@ def new_rows(table: GaussianTable, rows: Tensor, slots: Tensor, time: int, step:
     """Return copies of the rows `rows` as new Gaussians, born in the slots of `child_ids`."""
     names, parents = (*PARAMETERS, "level"), table["id"][rows]
     new = dict(zip(names, take_rows([table[name] for name in names], rows), strict=True))
-    return (
-        new
-        | table.inherited(rows)
-        | {
-            "id": child_ids(parents, time, slots),
-            "parent": parents,
-            "birth": torch.full_like(rows, time, dtype=torch.int32),
-            "last_step": torch.full_like(rows, step, dtype=torch.int32),
-        }
-    )
+    own = {"id": child_ids(parents, time, slots), "parent": parents}
+    dates = {"birth": time, "last_step": step}
+    own |= {name: torch.full_like(rows, date, dtype=torch.int32) for name, date in dates.items()}
+    return new | table.inherited(rows) | own
 
 
 def _shrink(children: dict[str, Tensor], seed: int, time: int) -> None:
@@ -286,8 +255,8 @@ def memory_limit(table: GaussianTable, ranks: Ranks) -> int | None:
     """Predict how many Gaussians fit into the memory of all ranks; None if the CPU computes. Collective.
 
     The memory is that of the GPUs, or of the hosts if the tables are stored there. A density event makes a
-    second copy of one column at a time. A step also needs scratch memory on the GPU, which is assumed to grow
-    with the population: the largest amount so far beyond the table, per Gaussian.
+    second copy of one column at a time. A step also needs scratch memory on the GPU: the largest amount so
+    far beyond the table, per Gaussian.
     """
     if ranks.device.type != "cuda":
         return None

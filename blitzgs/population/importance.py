@@ -1,13 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The importance passes: a sweep over all training views scores every Gaussian, then some are pruned.
 
-docs/guide/fewer-gaussians.md defines the scores, phi and the cull matrix. "density" is the contribution per
-pixel, however many pixels a Gaussian covers, so large Gaussians are pruned first. "weight" is the total
-contribution, which the images lose if the Gaussian is pruned. "energy" is proportional to the squared error
-of the images after it is pruned, if every Gaussian differs equally from the colours behind it.
-
-The views see the Gaussians of all ranks. All sums are integers, so every result has the same bits at any
-world size and for any division of the work.
+docs/guide/fewer-gaussians.md defines the scores, phi and the cull matrix. The views see the Gaussians of all
+ranks. All sums are integers, so every result has the same bits at any world size and for any division of the
+work.
 """
 
 from __future__ import annotations
@@ -82,24 +78,19 @@ class Importance:
 
 
 def sweep(
-    gaussians: TableOrPool,
-    batches: Iterable[ViewBatch],
-    n_views: int,
+    gaussians: TableOrPool,  # this rank's, without pending optimiser steps
+    batches: Iterable[ViewBatch],  # the views, each once, in the same batches on every rank
+    n_views: int,  # V, columns of the cull matrix
     options: RenderOptions,
     ranks: Ranks,
-    owners: TileOwners | None = None,
-    rule: ScoreRule = "density",
-    lod: ModelGate | None = None,
-    stops: Callable[[], bool] | None = None,
+    owners: TileOwners | None = None,  # divides the tiles by their costs; the result does not depend on it
+    rule: ScoreRule = "density",  # of the score
+    lod: ModelGate | None = None,  # leaves Gaussians out of views, where they hide nothing either
+    stops: Callable[[], bool] | None = None,  # asked before a batch; the same on every rank
 ) -> Importance:
     """Score the Gaussians by their contributions to V views. Collective: every rank calls it.
 
-    `gaussians`: this rank's, without pending optimiser steps. `batches`: the views, each once, in the same
-    batches on every rank. `n_views`: V, columns of the cull matrix. `owners`: divides the tiles by their
-    costs; the result does not depend on it. `rule`: of the score. `lod`: leaves Gaussians out of views as
-    rendering does; there they contribute nothing and hide nothing. `stops`: whether to give up, asked before
-    each batch but the first; the same answer on every rank. SweepStoppedError: `stops` said so; the table is
-    as it was.
+    SweepStoppedError: `stops` said so; the table is as it was.
     """
     table = table_of(gaussians)
     sums = _Sums(len(table), n_views, table.device, rule)
@@ -183,12 +174,9 @@ class _Sums:
         self._rule = rule
         # Terms are integers in a unit for which the sum over all views fits into 62 bits.
         self._unit = 2.0 ** -min(48, 62 - n_views.bit_length() - _TERM_BITS[rule])
-        self._sums = ViewSums(
-            torch.zeros(count, dtype=torch.int64, device=device),
-            torch.zeros(count, dtype=torch.int32, device=device),
-            torch.zeros(count, dtype=torch.int32, device=device),
-            _all_culled(n_views, device).repeat(count, 1),
-        )
+        dtypes = (torch.int64, torch.int32, torch.int32)
+        score, seen, counted = (torch.zeros(count, dtype=dtype, device=device) for dtype in dtypes)
+        self._sums = ViewSums(score, seen, counted, _all_culled(n_views, device).repeat(count, 1))
 
     def add(self, found: Survey, columns: Sequence[int], surveyed: VisibleRows, ranks: Ranks) -> None:
         """Add the splats of a batch of views."""
@@ -197,12 +185,8 @@ class _Sums:
             found.weights, splats.camera_ids, splats.gaussian_ids, ids, VIEW_MASS, ranks, len(columns)
         )
         home = self._sums.score.device  # where the whole table is
-        lists = (
-            surveyed.rows_of(splats.visible_ids).to(home),
-            splats.splat_offsets.to(home),
-            splats.camera_ids.to(home),
-            splats.radii.to(home),
-        )
+        rows, offsets = surveyed.rows_of(splats.visible_ids).to(home), splats.splat_offsets.to(home)
+        lists = rows, offsets, splats.camera_ids.to(home), splats.radii.to(home)
         # The rule "energy" adds up the squares as the rule "weight" adds up the weights, without a divisor.
         terms, rule = (found.weights, self._rule) if found.squares is None else (found.squares, "weight")
         view_sums_(
@@ -224,40 +208,31 @@ def _all_culled(n_views: int, device: torch.device) -> Tensor:
     return torch.from_numpy(words)[None].to(device)
 
 
-def sample_by_score(score: Tensor, ids: Tensor, keep: float, seed: int, event: int, ranks: Ranks) -> Tensor:
+def sample_by_score(
+    score: Tensor,  # float32 [N_rank], >= 0
+    ids: Tensor,  # int64 [N_rank], persistent
+    keep: float,  # share of all ranks' N Gaussians, in [0, 1]; its decimal value counts
+    seed: int,
+    event: int,  # number that differs between draws, such as the time of the pass
+    ranks: Ranks,  # the job; every rank calls this
+) -> Tensor:
     """Draw the Gaussians that pass 1 keeps: without replacement, with probability proportional to score.
 
     The Gaussians with the floor(keep N) smallest values of -log(u) / score are kept (exponential races,
     Efraimidis and Spirakis 2006), where u depends only on (seed, event, id). A Gaussian with score zero is
-    kept only if all with positive scores are.
-
-    Args:
-        score: float32 [N_rank], >= 0.
-        ids: int64 [N_rank], persistent.
-        keep: share of all ranks' N Gaussians, in [0, 1]; its decimal value counts.
-        event: number that differs between draws, such as the time of the pass.
-        ranks: the job; every rank calls this.
-
-    Returns:
-        bool [N_rank], the same ids at every world size.
+    kept only if all with positive scores are. Returns bool [N_rank], the same ids at every world size.
     """
     return smallest(sampling_keys(score, ids, seed, event), ids, _share_of_all(keep, score, ranks), ranks)
 
 
-def top_by_score(score: Tensor, ids: Tensor, mass: float, keep: float, ranks: Ranks) -> Tensor:
-    """Choose the Gaussians that pass 2 keeps: a prefix of the order by descending score.
-
-    Args:
-        score: float32 [N_rank], finite, >= 0.
-        ids: int64 [N_rank], persistent; they decide between equal scores.
-        mass: the prefix is the shortest that holds this share of the total score of all ranks, in [0, 1].
-        keep: the prefix has at most floor(keep N) of all ranks' N Gaussians; in [0, 1], its decimal value
-            counts.
-        ranks: the job; every rank calls this.
-
-    Returns:
-        bool [N_rank], the same ids at every world size.
-    """
+def top_by_score(
+    score: Tensor,  # float32 [N_rank], finite, >= 0
+    ids: Tensor,  # int64 [N_rank], persistent; they decide between equal scores
+    mass: float,  # the shortest prefix that holds this share of the score of all ranks, in [0, 1]
+    keep: float,  # but at most floor(keep N) of all ranks' N Gaussians; its decimal value counts
+    ranks: Ranks,  # the job; every rank calls this
+) -> Tensor:
+    """Choose what pass 2 keeps, bool [N_rank], the same ids at any world size: the best by score."""
     kept = mass_prefix(score, ids, mass, ranks)
     if keep < 1:
         kept &= smallest(-score, ids, _share_of_all(keep, score, ranks), ranks)

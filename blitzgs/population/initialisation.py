@@ -37,38 +37,34 @@ class FirstGaussians:
 
     def table(
         self,
-        sh_degree: int,
-        opacity: float,
+        sh_degree: int,  # highest degree of the table
+        opacity: float,  # of all of them, in (0, 1)
         device: torch.device | str = "cpu",
-        part: slice = slice(None),  # noqa: B008  (a slice cannot be changed)
+        part: slice = slice(None),  # noqa: B008  (which of them the table gets)
     ) -> GaussianTable:
-        """Make a table of them, without rotation; ids count from 0.
-
-        `sh_degree`: highest degree of the table. `opacity`: of all of them, in (0, 1). `part`: which of them
-        the table gets.
-        """
+        """Make a table of them, without rotation; ids count from 0."""
         means = self.means[part].to(device)
         sh = torch.zeros(len(means), (sh_degree + 1) ** 2, 3, device=device)
         sh[:, 0] = self.colors[part].to(device)
-        return GaussianTable.create(
-            {
-                "means": means,
-                "quats": torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).repeat(len(means), 1),
-                "scales": self.log_scales[part].to(device)[:, None].repeat(1, 3),
-                "opacities": torch.full((len(means),), opacity_logit(opacity), device=device),
-                "sh": sh,
-                "level": self.levels[part].to(device),
-                "id": torch.arange(len(self))[part].to(device),
-            }
-        )
+        rows = {
+            "means": means,
+            "quats": torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).repeat(len(means), 1),
+            "scales": self.log_scales[part].to(device)[:, None].repeat(1, 3),
+            "opacities": torch.full((len(means),), opacity_logit(opacity), device=device),
+            "sh": sh,
+        }
+        level, ids = self.levels[part].to(device), torch.arange(len(self))[part].to(device)
+        return GaussianTable.create({**rows, "level": level, "id": ids})
 
 
 def octree_gaussians(
-    points: Tensor,
-    colors: Tensor,
-    centres: Tensor,
-    levels: Levels,
-    visible_threshold: float,
+    points: Tensor,  # SfM points, float64 [M, 3], on any device
+    colors: Tensor,  # their colours, uint8 [M, 3]
+    centres: Tensor,  # camera centres, float64 [V, 3]
+    levels: Levels,  # from `measure_levels` on the same points and cameras
+    visible_threshold: float,  # a voxel's level is resolvable in more than this share of cameras
+    # largest number of Gaussians. Whole levels are kept, from the coarsest on, and of the first level that
+    # does not fit a random part. 0: no limit.
     most: int = 0,
     seed: int = 0,
 ) -> FirstGaussians:
@@ -78,20 +74,7 @@ def octree_gaussians(
     (Kerbl et al. 2023).
 
     A Gaussian sits at its voxel's centre with the mean colour of the points inside and the mean distance of
-    its 3 nearest neighbours as its size.
-
-    Args:
-        points: SfM points, float64 [M, 3], on any device.
-        colors: their colours, uint8 [M, 3].
-        centres: camera centres, float64 [V, 3].
-        levels: from `measure_levels` on the same points and cameras.
-        visible_threshold: a voxel is kept when its level is resolvable in more than this share of the
-            cameras.
-        most: largest number of Gaussians. Whole levels are kept, from the coarsest on, and of the first level
-            that does not fit a random part. 0: no limit.
-
-    Raises:
-        ValueError: no voxel is left.
+    its 3 nearest neighbours as its size. ValueError: no voxel is left.
     """
     # The lower corner of the grids: below all points, unless outliers overflow the finest grid.
     reach = levels.voxel_size_of(levels.count - 1) * 2 ** (CELL_BITS - 1)

@@ -38,45 +38,28 @@ from blitzgs.table.table import GaussianTable, opacity_logit
 
 @torch.no_grad()
 def relocate(
-    table: GaussianTable,
-    rules: DensityRules,
+    table: GaussianTable,  # changed in place; the rows are those of `placement.place`
+    rules: DensityRules,  # thresholds for dead Gaussians, and the limit of the population
     *,
-    growth: float,
-    time: int,
-    step: int,
+    growth: float,  # share of the population that the event adds
+    time: int,  # time of the event, in images
+    step: int,  # the latest optimiser step; new rows are current up to it
     seed: int,
-    ranks: Ranks,
-    extent: float = 1.0,
-    level_count: int = 1,
-    lineage: Lineage | None = None,
-    pending: Pending | None = None,
+    ranks: Ranks,  # the job, whose tables together are the population; every rank calls this
+    extent: float = 1.0,  # of the scene, in the unit of the means, for the lineage's features
+    level_count: int = 1,  # number of octree levels; only used for the lineage's features
+    lineage: Lineage | None = None,  # logs births and deaths, or None
+    pending: Pending | None = None,  # pending steps of the table, which sources take; None: none
 ) -> DensityReport:
-    """Replace dead Gaussians by copies of live ones, and let the population grow.
+    """Replace dead Gaussians by copies of live ones, and let the population grow (3DGS-MCMC, section 3.4).
 
     Dead Gaussians are those that density control would prune. The number of copies is that of the dead plus
-    the share `growth` of the population. Live Gaussians are drawn for copying in proportion to their opacity
-    (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo", section 3.4). A Gaussian and
-    its copies have one position, and share opacity and size such that together they look like the Gaussian
-    before (`shared_among_copies`). The copied Gaussian keeps its moments, scaled as its gradients are
-    (`share_rows_`), and the copies begin with moments of zero. Copies have the level, phi and cull row of the
-    Gaussian that they copy, and no statistics. Draws and ids depend only on (seed, time, id), so the result
-    depends neither on the order of the rows nor on the number of ranks.
-
-    Args:
-        table: changed in place; the rows are those of `placement.place`.
-        rules: thresholds for dead Gaussians, and the limit of the population.
-        growth: share of the population that the event adds.
-        time: time of the event, in images.
-        step: the latest optimiser step; new rows are current up to it.
-        ranks: the job, whose tables together are the population; every rank calls this.
-        extent: extent of the scene, in the unit of the means; only used for the lineage's features.
-        level_count: number of octree levels; only used for the lineage's features.
-        lineage: logs births and deaths, or None.
-        pending: the table's pending steps, of which the copied Gaussians take theirs; None: there are none.
-
-    Returns:
-        The report; `cloned` is the number of all copies on this rank, `relocated` that of the dead they
-        replace.
+    the share `growth` of the population. Live Gaussians are drawn for copying in proportion to their opacity.
+    A Gaussian and its copies have one position, and share opacity and size such that together they look like
+    the Gaussian before (`shared_among_copies`). It keeps its moments, scaled as its gradients are
+    (`share_rows_`); copies begin with moments of zero and without statistics, and have its level, phi and
+    cull row. Draws and ids depend only on (seed, time, id). In the report, `cloned` is the number of all
+    copies on this rank, `relocated` that of the dead they replace.
     """
     opacities = current(table, "opacities", pending)
     causes = death_causes(table, rules, opacities, pending)
@@ -102,13 +85,9 @@ def relocate(
     # of them undo what a run has learnt (docs/decisions.md). No variable keeps the columns, because `replace`
     # frees those that it makes longer.
     share_rows_(
-        table["opacities"],
-        table["scales"],
-        (*table.exp_avgs, *table.exp_avg_sqs),
-        sources,
-        copies + 1,
+        table["opacities"], table["scales"], (*table.exp_avgs, *table.exp_avg_sqs), sources, copies + 1,
         opacity_logit(rules.min_opacity),
-    )
+    )  # fmt: skip
     # Slots after those of clones and splits, which may have the same parents in the same event.
     first = (copies.cumsum(0) - copies).repeat_interleave(copies, output_size=len(parents))
     slots = torch.arange(len(parents), device=parents.device) - first + (CHILDREN_OF_A_SPLIT + 1)
@@ -145,17 +124,15 @@ def shared_among_copies(opacities: Tensor, scales: Tensor, copies: Tensor) -> tu
 def draw_in_proportion(
     weights: Tensor, total: int, count: int, ids: Tensor, seed: int, time: int, ranks: Ranks
 ) -> Tensor:
-    """Draw `count` times in proportion to weights, over all ranks.
+    """Draw `count` times in proportion to weights, over all ranks; every rank calls this.
 
     The expectation for each row is count w / sum(w), as in a multinomial draw. A row gets the integer part of
     this number for certain; the fractional parts are drawn without replacement (residual resampling, Liu and
     Chen 1998). This has the least variance, and exactly `count` draws in all, except that no row is drawn
     `MAX_COPIES` times.
 
-    `weights`: int64 [N_rank], 0 to 2^31, fewer than 2^31 over all ranks; `total`: their sum over all ranks.
-    `count`: below 2^31. `ids`: int64 [N_rank], persistent. `time`: of the event, in images. Every rank calls
-    this. Returns int64 [N_rank], how often each row was drawn, the same for the same ids at every world size;
-    zeros if all weights are 0.
+    `weights`: int64 [N_rank], 0 to 2^31, fewer than 2^31 over all ranks, as is `count`; `total`: their sum.
+    Returns int64 [N_rank], how often each row was drawn; zeros if all weights are 0.
     """
     if total == 0 or count <= 0:
         return torch.zeros_like(weights)
@@ -169,8 +146,8 @@ def draw_in_proportion(
 class PositionNoise:
     """The noise term of 3DGS-MCMC (Kheradmand et al. 2024, eq. 8), for the Gaussians that a step sees.
 
-    In 3DGS-MCMC, the noise depends on the unit of length, because it contains the covariance, a squared
-    length. Here it is divided by the squared extent of the scene, so that it does not.
+    It contains the covariance, a squared length, and is divided by the squared extent of the scene, so that
+    it does not depend on the unit of length.
     """
 
     factor: float  # `optimiser.position_noise`
@@ -179,19 +156,9 @@ class PositionNoise:
     seed: int
 
     def add(self, table: GaussianTable, visible_ids: Tensor, step: int, position_rate: float) -> None:
-        """Add noise to the means of rows `visible_ids` (int32 [U]), which are current up to `step`.
-
-        `position_rate` is the step's learning rate of the means, in their unit.
-        """
+        """Add noise to the means of rows, int32 [U], current up to `step`; the rate is that of the means."""
+        means, quats, scales, opacities, _ = table.parameters
         position_noise_(
-            table["means"],
-            table["quats"],
-            table["scales"],
-            table["opacities"],
-            table["id"],
-            visible_ids,
-            seed=self.seed,
-            step=step,
-            threshold=self.threshold,
-            strength=self.factor * position_rate / self.extent**2,
-        )
+            means, quats, scales, opacities, table["id"], visible_ids, seed=self.seed, step=step,
+            threshold=self.threshold, strength=self.factor * position_rate / self.extent**2,
+        )  # fmt: skip

@@ -143,10 +143,7 @@ def _visible(parameters: list[Tensor], viewmat: Tensor, near: float, far: float)
 
 
 def _clamped_jacobian(x: Tensor, y: Tensor, z: Tensor, K: Tensor, width: int, height: int) -> Tensor:
-    """Return d(pixel)/d(camera point) [M, 2, 3] with the slopes held within 0.15 images of the borders.
-
-    For a centred principal point that is 1.3 tan(fov / 2).
-    """
+    """Return d(pixel)/d(camera point) [M, 2, 3], slopes held within 0.15 images of the borders."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     u = torch.clamp(x / z, (-0.15 * width - cx) / fx, (1.15 * width - cx) / fx)
     v = torch.clamp(y / z, (-0.15 * height - cy) / fy, (1.15 * height - cy) / fy)
@@ -176,33 +173,26 @@ def unscented_splats(
     quats: Tensor,
     scales: Tensor,
     view: View,
-    *,
     alpha: float = 0.1,
-    beta: float = 2.0,
-    kappa: float = 0.0,
-    eps2d: float = 0.3,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return means2d [N, 2], covariances with and without eps2d [2, N, 2, 2], depths [N], validity [N, 7].
+    """Return means2d [N, 2], covariances with and without 0.3 I [2, N, 2, 2], depths [N], validity [N, 7].
 
-    The sums over weighted points of Wan and van der Merwe (2000); a splat needs a valid one.
+    The sums over weighted points of Wan and van der Merwe (2000), beta = 2 and kappa = 0; a splat needs a
+    valid one.
     """
-    spread = math.sqrt(alpha**2 * (3 + kappa))
+    spread = math.sqrt(alpha**2 * 3)
     ends = spread * covariance_factors(quats, scales).mT
     points = means[:, None] + torch.cat([torch.zeros_like(ends[:, :1]), ends, -ends], dim=1)
     pixels, valid = _pixels(points, view)
     first, other = 1 - 3 / spread**2, 0.5 / spread**2
     weights = torch.tensor([first] + [other] * 6, dtype=means.dtype)
     means2d = (weights[:, None] * pixels).sum(dim=1)
-    weights = torch.tensor([first + 1 - alpha**2 + beta] + [other] * 6, dtype=means.dtype)
+    weights = torch.tensor([first + 1 - alpha**2 + 2] + [other] * 6, dtype=means.dtype)
     apart = pixels - means2d[:, None]
     covariances = (weights[:, None, None] * apart[..., :, None] * apart[..., None, :]).sum(dim=1)
     depths = _points_at(means, view, torch.full_like(means[:, 0], 0.5))[:, 2]
-    return (
-        means2d,
-        torch.stack([covariances + eps2d * torch.eye(2, dtype=means.dtype), covariances]),
-        depths,
-        valid,
-    )
+    both = torch.stack([covariances + 0.3 * torch.eye(2, dtype=means.dtype), covariances])
+    return means2d, both, depths, valid
 
 
 def _pixels(points: Tensor, view: View) -> tuple[Tensor, Tensor]:

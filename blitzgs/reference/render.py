@@ -28,31 +28,22 @@ class Composite:
 
 
 def composite(
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    depths: Tensor,
-    width: int,
-    height: int,
+    means2d: Tensor,  # [M, 2] px
+    conics: Tensor,  # [M, 3]
+    opacities: Tensor,  # [M]
+    colors: Tensor,  # [M, D]
+    depths: Tensor,  # [M], ascending
+    width: int,  # px
+    height: int,  # px
     *,
+    # relative distance within which alpha (to 1/255 or 0.99), transmittance (to 1e-4) or the depths of two
+    # consecutive splats of a pixel count as undecided
     tolerance: float = 1e-4,
 ) -> Composite:
     """Composite M splats that are ordered front to back.
 
     alpha = min(0.99, o exp(-q / 2)), q the Mahalanobis distance of the pixel centre; a splat takes part where
     alpha >= 1/255; one that would take the transmittance below 1e-4 is left out and ends the pixel.
-
-    Args:
-        means2d: [M, 2] px.
-        conics: [M, 3].
-        opacities: [M].
-        colors: [M, D].
-        depths: [M], ascending.
-        width: px.
-        height: px.
-        tolerance: relative distance within which alpha (to 1/255 or 0.99), transmittance (to 1e-4) or the
-            depths of two consecutive splats of a pixel count as undecided.
     """
     unclipped, alphas, before, after, weights = _weights(means2d, conics, opacities, width, height)
     values = torch.einsum("mp,md->pd", weights, colors)
@@ -108,25 +99,22 @@ def _cut(unclipped: Tensor, after: Tensor, before: Tensor, depths: Tensor, toler
     return ((undecided | tie) & reached).any(dim=0)
 
 
-def median_splats(weights: Tensor) -> Tensor:
-    """Return the last splat composited with a transmittance above 0.5 in front of it, int64 [H, W]; -1: none.
-
-    Args:
-        weights: alpha T of M splats, front to back, [M, H, W], zero where a splat is not composited.
-    """
+def median_splats(
+    weights: Tensor,  # alpha T of M splats, front to back, [M, H, W], zero where a splat is not composited
+) -> Tensor:
+    """Return the last splat composited with a transmittance above 0.5 in front, int64 [H, W]; -1: none."""
     before = 1 - (weights.cumsum(dim=0) - weights)
     numbers = torch.arange(len(weights))[:, None, None].expand_as(weights)
     return torch.where((weights > 0) & (before > 0.5), numbers, -1).amax(dim=0)
 
 
-def strongest_splats(weights: Tensor, count: int) -> tuple[Tensor, Tensor]:
+def strongest_splats(
+    weights: Tensor,  # as for `median_splats`
+    count: int,  # number of splats of a pixel
+) -> tuple[Tensor, Tensor]:
     """Return the splats of the largest weights, front to back, int64 [H, W, count], and their weights.
 
     Of equal weights, the splats in front. Padded with -1 and 0.
-
-    Args:
-        weights: as for `median_splats`.
-        count: number of splats of a pixel.
     """
     weights = torch.cat([weights, weights.new_zeros(count, *weights.shape[1:])])
     largest = weights.argsort(dim=0, descending=True, stable=True)[:count].sort(dim=0).values
@@ -177,15 +165,11 @@ def render(
         colors: SH coefficients [N, K, 3] with `sh_degree`, else values [N, D].
         viewmat: [4, 4] world to camera.
         K: [3, 3].
-        width: px.
-        height: px.
+        width, height, near_plane, far_plane, eps2d: as for `blitzgs.rasterization`.
         sh_degree: degree to evaluate, 0 to 3, or None.
         background: [D] colour behind everything; None for black. Depth has none.
         render_mode: RGB, D (sum of weight times z), ED (that over alpha), RGB+D or RGB+ED.
-        near_plane: Gaussians have z > near_plane.
-        far_plane: Gaussians have z <= far_plane.
-        eps2d: variance added to both screen axes, px^2.
-        antialiased: compensate the opacity for that addition.
+        antialiased: compensate the opacity for the addition of eps2d.
         tolerance: see `composite`.
 
     Raises:
@@ -260,7 +244,6 @@ def contributions(
     *,
     near_plane: float = 0.01,
     far_plane: float = 1e10,
-    eps2d: float = 0.3,
     antialiased: bool = False,
 ) -> Contributions:
     """Compute what activated Gaussians contribute to views; arguments as for `blitzgs.contributions`."""
@@ -270,7 +253,7 @@ def contributions(
     result = Contributions(*(torch.zeros(shape, dtype=dtype) for dtype in dtypes))
     for v, camera in enumerate(zip(viewmats, Ks, strict=True)):
         tensors: Any = (tensor.double() for tensor in (means, quats, scales, opacities, means, *camera))
-        splats = project_splats(*tensors, **view, sh_degree=None, eps2d=eps2d, antialiased=antialiased)
+        splats = project_splats(*tensors, **view, sh_degree=None, eps2d=0.3, antialiased=antialiased)
         weights, cut = composited_weights(
             splats.means2d, splats.conics, splats.opacities, splats.depths, width, height
         )
@@ -308,17 +291,15 @@ class Scores:
     c_vis: Tensor  # bool [V, N], whether it is within the top 99 % of the view's mass
 
 
-def scores(units: Tensor, pixels: Tensor, visible: Tensor, ids: Tensor, eps: float, phi_eps: float) -> Scores:
-    """Aggregate contributions over the views.
-
-    Args:
-        units: int64 [V, N], weights in units of 2^-32.
-        pixels: int64 [V, N].
-        visible: bool [V, N].
-        ids: int64 [N], which decide between equal weights.
-        eps: added to the pixels in the score.
-        phi_eps: added to c_rad in phi.
-    """
+def scores(
+    units: Tensor,  # int64 [V, N], weights in units of 2^-32
+    pixels: Tensor,  # int64 [V, N]
+    visible: Tensor,  # bool [V, N]
+    ids: Tensor,  # int64 [N], which decide between equal weights
+    eps: float,  # added to the pixels in the score
+    phi_eps: float,  # added to c_rad in phi
+) -> Scores:
+    """Aggregate contributions over the views."""
     c_vis = torch.tensor(
         [top_mass(view, ids.tolist(), Fraction(99, 100)) for view in units.tolist()], dtype=torch.bool
     )

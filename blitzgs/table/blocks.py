@@ -71,8 +71,7 @@ def _without_far(points: Tensor) -> Tensor:
     if len(points) == 0:
         return points
     sample = points[:: -(-len(points) // _SAMPLE)]
-    # Of each axis, the finite values in order, and infinite ones. Quantiles that are values of the sample are
-    # the same on all devices.
+    # The finite values of each axis in order, then infinite ones. The same on all devices.
     ordered = sample.where(sample.isfinite(), torch.inf).sort(dim=0).values
     last = (sample.isfinite().sum(dim=0) - 1).clamp(min=0).double()
     low, high = ordered.gather(0, torch.stack((_SHARE * last, (1 - _SHARE) * last)).round().long())
@@ -85,16 +84,12 @@ def _without_far(points: Tensor) -> Tensor:
 class BlockIndex:
     """Bounds of blocks of 256 consecutive rows of one table, updated as an optimiser moves rows.
 
-    Build a new index whenever rows were added, removed or reordered. Sort the table by `morton_order` first:
-    the active set is right in any order, but in a random order blocks are large and no block is skipped.
+    Build a new one whenever rows were added, removed or reordered. The active set is right in any order, but
+    without `morton_order` blocks are large and none is skipped.
     """
 
     def __init__(self, table: GaussianTable, pending_table: Tensor | None = None) -> None:
-        """Compute the bounds of every block of the table.
-
-        `pending_table`: `AdamSchedule.table` of the lazy optimiser, if rows may have pending steps; None:
-        they have none.
-        """
+        """Compute all bounds; `pending_table` is `AdamSchedule.table`, if rows may have pending steps."""
         self._pending_table = pending_table
         count = -(-len(table) // BLOCK_ROWS)
         # The bounds of each block, float32 [blocks, 8]; see `update_block_bounds_` for their layout.
@@ -166,10 +161,8 @@ class Cameras(NamedTuple):
     viewmats: Tensor  # float32 [V, 4, 4], world to camera
     Ks: Tensor  # float32 [V, 3, 3], pixels
     sizes: Tensor  # int32 [V, 2], width and height, pixels
-    # Near plane, far plane and eps2d, as `blitzgs.ops.blocks.cull_blocks` has them.
-    limits: tuple[float, float, float]
-    # The views' columns in the cull matrix, int64 [V]; None: the views have no mask.
-    columns: Tensor | None = None
+    limits: tuple[float, float, float]  # near plane, far plane and eps2d, as in `cull_blocks`
+    columns: Tensor | None = None  # their columns in the cull matrix, int64 [V]; None: no mask
 
 
 class BlockVisibility:

@@ -80,12 +80,9 @@ class HostTable(GaussianTable):
 
 def fits(memory: Tensor | None, like: Tensor, rows: int) -> bool:
     """Tell whether memory can hold some rows of a column."""
-    return (
-        memory is not None
-        and memory.dtype == like.dtype
-        and memory.shape[1:] == like.shape[1:]
-        and len(memory) >= rows
-    )
+    if memory is None or memory.dtype != like.dtype:
+        return False
+    return memory.shape[1:] == like.shape[1:] and len(memory) >= rows
 
 
 def available_bytes() -> int:

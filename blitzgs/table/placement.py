@@ -29,10 +29,9 @@ def place(count: int, gone: Tensor, beside: Tensor, means: Tensor) -> Placement:
 
     Rows that leave are taken as opening brackets in the order of their blocks, and new rows as closing ones,
     behind those of the same block; a bracket and the one that closes it get the same row. So in each block as
-    many new rows as possible replace others, and other pairs are close.
-
-    `count`: N. `gone`: int64 [D], ascending, the rows that leave. `beside`: int64 [M], rows near which the
-    new Gaussians lie, such as their parents'; they may be leaving. `means`: float32 [M, 3], their positions.
+    many new rows as possible replace others, and other pairs are close. `gone`: int64 [D], ascending, the
+    rows that leave. `beside`: int64 [M], rows near which the new Gaussians lie, such as their parents'; they
+    may be leaving. `means`: float32 [M, 3], their positions.
     """
     leaving, joining = len(gone), len(beside)
     blocks, by_block = torch.sort(beside // BLOCK_ROWS, stable=True)
@@ -42,8 +41,7 @@ def place(count: int, gone: Tensor, beside: Tensor, means: Tensor) -> Placement:
     is_left = torch.ones_like(gone, dtype=torch.bool)
     torch.ops.blitzgs.match_brackets_(new, is_left, keys, order, gone, by_block)
 
-    # Rows that are left and new Gaussians that are left come together one by one; those that are appended are
-    # in Morton order.
+    # Rows and new Gaussians that are left come together one by one; what is appended is in Morton order.
     rank_left = is_left.cumsum(0)
     left = gone.new_empty(leaving + 1)
     left[(rank_left - 1).where(is_left, leaving)] = gone
@@ -79,10 +77,9 @@ def _without_end(count: int, total: int, new: Tensor, free: Tensor) -> Placement
 def redistribute(table: GaussianTable, ranks: Ranks, max_imbalance: float = MAX_IMBALANCE) -> bool:
     """If the shards have become unequal, move the row at position p of the global order to rank p mod M.
 
-    Collective: every rank calls it. All columns are moved; each shard has its rows in the global order.
-
-    `table`: this rank's shard, changed in place. `max_imbalance`: nothing happens up to this ratio of the
-    largest to the smallest shard; 0: always redistribute. Returns whether rows were redistributed.
+    Collective. All columns are moved; each shard has its rows in the global order. `max_imbalance`: nothing
+    happens up to this ratio of the largest to the smallest shard; 0: always redistribute. Returns whether
+    rows moved.
     """
     if ranks.world_size == 1:
         return False
@@ -100,14 +97,11 @@ def redistribute(table: GaussianTable, ranks: Ranks, max_imbalance: float = MAX_
 
 
 def global_positions(sizes: Sequence[int], rank: int) -> Tensor:
-    """Return the position in the global order of each row of one shard.
+    """Return the position in the global order of each row of one shard, int64, ascending.
 
     The global order is row 0 of every rank, then row 1 of every rank, and so on; ranks without further rows
-    are skipped. So a table that was divided round-robin keeps its order. Shards whose sizes differ by at most
-    one (the larger ones first) already have exactly the positions = rank (mod M).
-
-    `sizes`: rows on each rank, M values. `rank`: the rank of the shard. Returns int64 [sizes[rank]],
-    ascending.
+    are skipped. So a table that was divided round-robin keeps its order, and shards whose sizes differ by at
+    most one (the larger ones first) have exactly the positions = rank (mod M). `sizes`: rows on each rank.
     """
     rows = torch.arange(sizes[rank], dtype=torch.int64)
     positions = torch.zeros_like(rows)

@@ -71,12 +71,11 @@ class Pool:
 
     Between `load_for_step` and `write_back` the table on the host is out of date; `write_back` copies all
     changes to it and empties the pool.
-
-    Attributes:
-        table: the table on the host.
-        held: the table on the device; rows outside the blocks of `load_for_step`'s index are undefined.
-        moved: counts since the beginning.
     """
+
+    table: HostTable  # on the host
+    held: GaussianTable  # on the device; rows outside the blocks of `load_for_step`'s index are undefined
+    moved: Moved  # counts since the beginning
 
     def __init__(
         self, table: HostTable, device: torch.device, budget_bytes: int, pending_table: Tensor | None
@@ -219,9 +218,8 @@ class Pool:
     def prefetch(self, step: int) -> None:
         """Load the blocks of the next step, number `step`, while the step of `load_for_step` runs.
 
-        Call this after the host has waited for the running step's number of splats. Its active set is then
-        complete. Before that, the device may still read the cull masks of blocks that the step leaves out as
-        a whole, and this method may reuse their slots.
+        Call this after the host has waited for the running step's number of splats: before its active set is
+        complete, the device may still read the cull masks of blocks whose slots this method may reuse.
         """
         now = self._visibility.blocks_of_batch(0)
         slots = self._slot_of[now.nonzero()[0]]
@@ -232,8 +230,7 @@ class Pool:
         self._is_changed[slots] = True
         self._rest_changed = self._rest > 0
         self._count(steps=1, needed=len(slots))
-        # If a batch has more than half of the 32 views that are tested together, only the present batch is
-        # known.
+        # Of batches with more than half of the 32 views that are tested, only the present one is known.
         if self._visibility.batches > 1:
             following = self._visibility.blocks_of_batch(1)
             before = self.moved.loaded

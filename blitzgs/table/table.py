@@ -31,9 +31,8 @@ _PAST_MOST = 1.02
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 EXP_AVGS = tuple(f"exp_avg.{name}" for name in PARAMETERS)
 EXP_AVG_SQS = tuple(f"exp_avg_sq.{name}" for name in PARAMETERS)
-# What new rows have in a column: values that the caller gives, or zeros. Columns that are added to
-# a table later are inherited: the caller gives the values of the parents (`inherited`). All columns
-# move with their rows.
+# What new rows have in a column: values that the caller gives, or zeros. For columns that are added to a
+# table later, the caller gives the values of the parents (`inherited`).
 REQUIRED = (*PARAMETERS, "last_step", "id", "parent", "birth", "level")
 ZERO_AT_BIRTH = (*EXP_AVGS, *EXP_AVG_SQS, "moment_step", "grad_sum", "grad_count", "max_radii")
 # A step asks for these columns several times; one call finds all of a group.
@@ -73,32 +72,25 @@ class Placement(NamedTuple):
 
 
 def schema(sh_degree: int) -> dict[str, Column]:
-    """Return the columns of a table, in their order.
-
-    `sh_degree`: highest spherical-harmonics degree D; `sh` has K = (D + 1)^2 coefficients. Returns means [3],
-    quats [4], scales [3] (log), opacities [] (logit), sh [K, 3] as float32, their Adam moments `exp_avg.*`
-    and `exp_avg_sq.*`; last_step and moment_step int32 (the optimiser step up to which the row's parameters,
-    and its moments, are current); id int64 (persistent, unique over ranks), parent int64 (-1: none), birth
-    int32 (images seen when it was born), level uint8 (octree level); grad_sum float32, grad_count int32,
-    max_radii float32 (pixels): density statistics since the last density event.
-    """
-    f = torch.float32
+    """Return the columns of a table, in their order; `sh_degree`: the highest, of (D + 1)^2 coefficients."""
+    f, i = torch.float32, torch.int32
+    # Scales are logarithms, opacities logits.
     rows = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": ((sh_degree + 1) ** 2, 3)}
     columns = {name: Column(f, shape) for name, shape in rows.items()}
-    for prefix in ("exp_avg", "exp_avg_sq"):
+    for prefix in ("exp_avg", "exp_avg_sq"):  # Adam's moments
         columns |= {f"{prefix}.{name}": Column(f, shape) for name, shape in rows.items()}
-    columns |= {
-        "last_step": Column(torch.int32, ()),
-        "moment_step": Column(torch.int32, ()),
-        "id": Column(torch.int64, ()),
-        "parent": Column(torch.int64, ()),
-        "birth": Column(torch.int32, ()),
-        "level": Column(torch.uint8, ()),
-        "grad_sum": Column(f, ()),
-        "grad_count": Column(torch.int32, ()),
-        "max_radii": Column(f, ()),
+    scalars = {
+        "last_step": i,  # optimiser step up to which the row's parameters are current
+        "moment_step": i,  # the same of its moments
+        "id": torch.int64,  # persistent, unique over ranks
+        "parent": torch.int64,  # an id; -1: none
+        "birth": i,  # images seen when it was born
+        "level": torch.uint8,  # octree level
+        "grad_sum": f,  # this and the next two: statistics since the last density event
+        "grad_count": i,
+        "max_radii": f,  # pixels
     }
-    return columns
+    return columns | {name: Column(dtype, ()) for name, dtype in scalars.items()}
 
 
 def opacity_logit(opacity: float) -> float:
@@ -124,11 +116,9 @@ def stored_rows(name: str, count: int) -> int:
 class GaussianTable:
     """One rank's Gaussians as named columns of equal length N.
 
-    The operations `keep`, `permute`, `replace` and `move_rows` act on all columns, one column at a time, so
-    that peak memory exceeds the table by one column and not by a second table. `replace` touches only the
-    rows that change; for that, columns that grow have memory for more rows than they hold.
-
-    The column `CULL` is converted whenever it is set, read or moved.
+    Operations act on all columns, one column at a time, so that peak memory exceeds the table by one column
+    and not by a second table. `replace` touches only the rows that change; for that, columns that grow have
+    memory for more rows than they hold. The column `CULL` is converted whenever it is set, read or moved.
     """
 
     def __init__(self, columns: Mapping[str, Tensor]) -> None:
@@ -183,10 +173,7 @@ class GaussianTable:
 
     @classmethod
     def of_parameters(cls, columns: Mapping[str, Tensor]) -> GaussianTable:
-        """Build a table for rendering only: the columns of the optimiser are zeros that take no memory.
-
-        `columns`: `PARAMETERS`, and "level" and "id" if known.
-        """
+        """Build a table for rendering from `PARAMETERS`, "level" and "id"; other columns take no memory."""
         sh = columns["sh"]
         count, known = len(sh), dict(columns)
         if "id" not in known:
@@ -371,10 +358,7 @@ class GaussianTable:
                 self.columns[name] = column[: placement.total]
 
     def move_rows(self, destination_ranks: Tensor, ranks: Ranks) -> None:
-        """Move every row to a rank. Collective: every rank calls it. Rows arrive ordered by source rank.
-
-        `destination_ranks`: int64 [N], the rank each row goes to.
-        """
+        """Move each row to a rank, int64 [N]. Collective. Rows arrive ordered by source rank."""
         order = torch.argsort(destination_ranks, stable=True)
         counts = torch.bincount(destination_ranks, minlength=ranks.world_size)
         sent = counts.tolist()

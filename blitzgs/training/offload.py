@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.distributed.host_sum import HostSum
-from blitzgs.frame.render import Frame, RenderOptions, ViewFilter
+from blitzgs.frame.render import Frame, RenderOptions
 from blitzgs.frame.transport.protocol import stage_ended
 from blitzgs.ops.host import to_device
 from blitzgs.ops.projection_types import MAX_VIEWS
@@ -21,6 +21,7 @@ from blitzgs.training.batches import Batch
 from blitzgs.training.loss import LossTerms
 from blitzgs.training.sampler import BatchSampler
 from blitzgs.training.step import Stepper
+from blitzgs.view.gate import ViewGate
 from blitzgs.view.views import ViewSet
 
 
@@ -98,7 +99,7 @@ class OffloadingStepper(Stepper):
         return moved.values()
 
     def forward(
-        self, step: int, options: RenderOptions, batch: Batch, view_filter: ViewFilter | None = None
+        self, step: int, options: RenderOptions, batch: Batch, view_filter: ViewGate | None = None
     ) -> tuple[Frame, LossTerms, HostSum]:
         """See `Stepper.forward`."""
         self._up_to_date_at = None

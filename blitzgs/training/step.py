@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from blitzgs.distributed.host_sum import HostSum
-from blitzgs.frame.render import Frame, RenderOptions, ViewFilter, backward_splats, render_frame
+from blitzgs.frame.render import Frame, RenderOptions, backward_splats, render_frame
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport import open_transport
 from blitzgs.frame.transport.protocol import stage_ended
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from blitzgs.table.table import GaussianTable
     from blitzgs.training.batches import Batch
     from blitzgs.training.exposure import Exposures
+    from blitzgs.view.gate import ViewGate
     from blitzgs.view.visible import TableOrPool
 
 
@@ -81,7 +82,7 @@ class Stepper:
         return {}
 
     def forward(
-        self, step: int, options: RenderOptions, batch: Batch, view_filter: ViewFilter | None = None
+        self, step: int, options: RenderOptions, batch: Batch, view_filter: ViewGate | None = None
     ) -> tuple[Frame, LossTerms, HostSum]:
         """Apply pending steps of the rows that the views may see, render, and compare with the photographs.
 

@@ -28,10 +28,7 @@ _CONTROLS = re.compile("[\x00-\x08\x0a-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2
 
 
 def printable(text: str, lines: bool = False) -> str:
-    """Return text for a terminal: control characters, as in names of files, are written as escapes.
-
-    `lines`: line feeds stay; for text without names that somebody else chose.
-    """
+    """Return text for a terminal: control characters are escapes, but line feeds may stay (`lines`)."""
     return _CONTROLS.sub(lambda match: "\n" if lines and match[0] == "\n" else ascii(match[0])[1:-1], text)
 
 

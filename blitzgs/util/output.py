@@ -30,20 +30,15 @@ PARTIAL = re.compile(r"\.[0-9a-f]{12}\.partial")
 
 
 @contextmanager
-def new_file(path: Path, sync: bool = True) -> Iterator[Path]:
+def new_file(
+    path: Path,  # the final name; its folder must exist
+    sync: bool = True,  # wait until the file is on disk, so that the same holds after a power failure
+) -> Iterator[Path]:
     """Yield a temporary file to write; it gets its final name when the context ends without an error.
 
-    A reader of `path` sees the old file or the complete new one. Only a regular file is replaced.
-
-    Args:
-        path: the final name; its folder must exist.
-        sync: wait until the file is on disk, so that the same holds after a power failure.
-
-    Yields:
-        The temporary file, empty, in the same folder.
-
-    Raises:
-        OSError: `path` is a link, a device or a folder, or cannot be written; an existing file is unchanged.
+    A reader of `path` sees the old file or the complete new one. Only a regular file is replaced. Yields the
+    temporary file, empty, in the same folder. OSError: `path` is a link, a device or a folder, or cannot be
+    written; an existing file is unchanged.
     """
     check_replaceable(path)
     partial = path.with_name(f".{secrets.token_hex(6)}.partial")

@@ -45,14 +45,9 @@ def image_progress(what: str, shown: bool = True, unit: str = "images") -> Itera
     if shown and not console.is_terminal:
         yield lines(lambda text: print(f"{what}: {text} {unit}", file=sys.stderr, flush=True))
         return
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn(unit),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, disable=not shown, transient=True) as bar:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn(unit))
+    rest = TimeRemainingColumn()
+    with Progress(*columns, rest, console=console, disable=not shown, transient=True) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 

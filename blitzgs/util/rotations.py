@@ -25,14 +25,12 @@ def quaternions(rotations: Tensor) -> Tensor:
     wx, wy, wz = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]
     xy, xz, yz = r[:, 0, 1] + r[:, 1, 0], r[:, 0, 2] + r[:, 2, 0], r[:, 1, 2] + r[:, 2, 1]
     # Row i is 4 q_i q; the one with the largest q_i has the least rounding.
-    products = torch.stack(
-        [
-            torch.stack([1 + xx + yy + zz, wx, wy, wz], dim=1),
-            torch.stack([wx, 1 + xx - yy - zz, xy, xz], dim=1),
-            torch.stack([wy, xy, 1 - xx + yy - zz, yz], dim=1),
-            torch.stack([wz, xz, yz, 1 - xx - yy + zz], dim=1),
-        ],
-        dim=1,
+    rows = (
+        (1 + xx + yy + zz, wx, wy, wz),
+        (wx, 1 + xx - yy - zz, xy, xz),
+        (wy, xy, 1 - xx + yy - zz, yz),
+        (wz, xz, yz, 1 - xx - yy + zz),
     )
+    products = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
     best = products.diagonal(dim1=1, dim2=2).argmax(dim=1)
     return torch.nn.functional.normalize(products[torch.arange(len(r), device=r.device), best], dim=1)

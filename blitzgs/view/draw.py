@@ -66,11 +66,7 @@ class Drawer:
 
     @torch.no_grad()
     def draw(self, look: Look) -> Picture | None:
-        """Render one look; every rank of the job calls this with the same look.
-
-        Returns the picture on rank 0; None elsewhere. DrawingError: a rank lacks the memory, or cannot find
-        what the view sees.
-        """
+        """Render a look, the same on all ranks; rank 0 gets the picture (DrawingError: a rank cannot)."""
         begin, subject, ranks = time.perf_counter(), self._subject, self._owners.ranks
         device = ranks.device
         pose, K = (torch.from_numpy(matrix).float()[None].to(device) for matrix in (look.viewmat, look.K))
@@ -187,10 +183,7 @@ class Drawer:
 
 
 def _reserve(gaussians: TableOrPool, look: Look, device: torch.device) -> None:
-    """Allocate the memory of a frame, which torch keeps for it: without, one rank would fail in its middle.
-
-    RuntimeError: it cannot.
-    """
+    """Allocate the memory of a frame, which torch keeps for it: or one rank would fail in its middle."""
     if device.type == "cuda":
         rows = len(gaussians.held if isinstance(gaussians, Pool) else gaussians)
         size = rows * _ROW_BYTES + look.width * look.height * _PIXEL_BYTES

@@ -37,8 +37,7 @@ class LodGate:
     fork: float  # f, ratio of neighbouring levels
     count: int  # number of levels K
     finest: int  # the finest level that views keep, L_max in 0..K - 1
-    # Opacities fade out over half a level, centred at these distances, instead of being cut off.
-    smooth: bool = False
+    smooth: bool = False  # opacities fade out over half a level instead of being cut off
 
     def reach(self) -> list[float]:
         """Return for each of the K levels the distance up to which views keep it; -1: no view keeps it."""
@@ -48,20 +47,15 @@ class LodGate:
         return kept + [-1.0] * (self.count - len(kept))
 
     def fade(self) -> tuple[float, ...]:
-        """Return the numbers by which the projection fades opacities; empty: they do not fade.
+        """Return f / (f - 1), then `reach`, by which the projection fades opacities; empty: they do not fade.
 
         Let r be the reach of a Gaussian's level and d its distance from the camera. Its opacity is multiplied
         by clamp((1 - d^2 / r^2) f / (f - 1), 0, 1), which is 1 up to r / sqrt(f) and 0 from r on.
-
-        Returns f / (f - 1), then `reach`.
         """
         return (self.fork / (self.fork - 1), *self.reach()) if self.smooth else ()
 
     def weights(self, means: Tensor, level: Tensor, centre: Tensor) -> Tensor:
-        """Return the factors of `fade` for the opacities of Gaussians in one view, float64 [N].
-
-        `means`: [N, 3]. `level`: uint8 [N]. `centre`: position of the camera, float64 [3].
-        """
+        """Return the factors of `fade` of means [N, 3] with levels [N], from a camera [3]; float64 [N]."""
         slope, *reach = self.fade()
         reaches = torch.tensor(reach, dtype=torch.float64, device=means.device)
         reaches = reaches[level.long().clamp(max=self.count - 1)]
@@ -71,14 +65,14 @@ class LodGate:
 
 @dataclass(frozen=True)
 class ViewGate:
-    """LOD gate and cull mask of the views of one batch (`blitzgs.frame.render.ViewFilter`)."""
+    """LOD gate and cull mask of the views of one batch."""
 
     reach: Sequence[float]  # `LodGate.reach`
     lod_views: int  # bit v is set when view v has an LOD gate
     columns: Sequence[int] = ()  # the views' columns in the cull matrix; empty: no view has a mask
 
     def rules(self, table: GaussianTable) -> GateRules:
-        """See `blitzgs.frame.render.ViewFilter.rules`."""
+        """Return the rules for a table, as the ops take them."""
         mask = table.columns.get(CULL)
         sectors = None if mask is None else sectors_in(mask)
         return GateRules(table["level"], list(self.reach), self.lod_views, sectors, list(self.columns))
@@ -87,11 +81,10 @@ class ViewGate:
 class ModelGate:
     """The LOD gate of a model, applied only to views for which it leaves out enough Gaussians to pay.
 
-    A sample of the Gaussians of all ranks, drawn by their ids, predicts the share that each view would keep;
-    the prediction does not depend on the number of ranks. A view that would keep at least `most_kept` of all
-    Gaussians is rendered without the gate, because the gate would save little. So is a view that would keep
-    less than `least_kept`, which no training view does: there, coarse levels that have not been trained to
-    stand alone would show holes.
+    A sample of the Gaussians of all ranks, drawn by their ids, predicts the share that each view would keep.
+    A view that would keep at least `most_kept` of all is rendered without the gate, which would save little.
+    So is one that would keep less than `least_kept`, which no training view does: there, coarse levels that
+    have not been trained to stand alone would show holes.
     """
 
     def __init__(
@@ -119,10 +112,7 @@ class ModelGate:
         return other
 
     def kept(self, centres: Tensor) -> list[float]:
-        """Predict the share of all Gaussians that each view keeps. Collective.
-
-        `centres`: positions of the cameras, float64 [V, 3].
-        """
+        """Predict the share of Gaussians that views from positions float64 [V, 3] keep. Collective."""
         counts = torch.zeros(len(centres), dtype=torch.int64, device=self._means.device)
         length = max(1, _MAX_DISTANCES // max(1, len(self._means)))
         for begin in range(0, len(centres), length):
@@ -149,10 +139,7 @@ class ModelGate:
         return active
 
     def rows(self, means: Tensor, level: Tensor, viewmat: Tensor) -> Tensor:
-        """Return which Gaussians a view keeps, bool [N]; only for a single process.
-
-        `means`: float32 [N, 3]. `level`: uint8 [N]. `viewmat`: float32 [1, 4, 4].
-        """
+        """Return which Gaussians a view, float32 [1, 4, 4], keeps, bool [N]; only for a single process."""
         active = self.active({"means": means, "level": level}, viewmat)
         return torch.ones_like(level, dtype=torch.bool) if active is None else active.views != 0
 

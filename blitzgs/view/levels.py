@@ -47,10 +47,8 @@ class Levels:
 def farthest(level: int, reference_distance: float, fork: float) -> float:
     """Return the largest distance from which a level is resolvable, in the unit of `reference_distance`.
 
-    BlitzGS Eq. 1 rounds log_f(d_0 / d) to the nearest integer, so level l is resolvable up to
-    d = d_0 f^(1/2 - l). Level 0 is resolvable from any distance.
-
-    `level`: l. `reference_distance`: d_0. `fork`: f.
+    BlitzGS Eq. 1 rounds log_f(d_0 / d), f the fork, to the nearest integer, so level l is resolvable up to d
+    = d_0 f^(1/2 - l). Level 0 is resolvable from any distance.
     """
     return math.inf if level == 0 else reference_distance * fork ** (0.5 - level)
 
@@ -63,26 +61,21 @@ def level_fork(config: Config) -> float:
 def footprint_sizes(scales: Tensor, opacities: Tensor) -> Tensor:
     """Return the logarithms of o sqrt(a b) of Gaussians, float64 [N], in the unit of the scales.
 
-    a and b are the largest two scales of a Gaussian and o is its opacity. This size times the focal length
-    over the distance is its footprint in pixels. In a picture that sees the broad side of the Gaussian and
-    nothing in front, pi times the square of the footprint is the sum of alpha^2, to which the squared error
-    is proportional that leaving the Gaussian out makes.
-
-    `scales`: logarithms, [N, 3]. `opacities`: logits, [N].
+    a and b are the largest two scales (given as logarithms, [N, 3]) and o is the opacity (logits, [N]). This
+    size times the focal length over the distance is the footprint in pixels. Where a picture sees the broad
+    side and nothing in front, pi times its square is the sum of alpha^2, to which the squared error is
+    proportional that leaving the Gaussian out makes.
     """
     broad = scales.double().sum(1) - scales.double().amin(1)
     return 0.5 * broad + torch.nn.functional.logsigmoid(opacities.double())
 
 
 def footprint_levels(sizes: Tensor, reach: float, reference_distance: float, fork: float) -> Tensor:
-    """Return the levels that follow what Gaussians are, uint8 [N].
+    """Return the levels that follow what Gaussians are, uint8 [N], from their `footprint_sizes`.
 
     The level is the finest whose `farthest` distance is at least that at which the footprint becomes too
     small. So a view that leaves out levels by distance leaves out only Gaussians of smaller footprints.
-
-    `sizes`: `footprint_sizes`, [N]. `reach`: distance at which the footprint of a size of 1 becomes too
-    small: the focal length in pixels over the smallest footprint. `reference_distance`: d_0 of the levels.
-    `fork`: ratio of neighbouring levels, of which there are `FOOTPRINT_LEVELS`.
+    `reach`: this distance for a size of 1, the focal length in pixels over the smallest footprint.
     """
     level = ((math.log(reference_distance / reach) - sizes) / math.log(fork) + 0.5).floor()
     return level.clamp(0, FOOTPRINT_LEVELS - 1).to(torch.uint8)
@@ -149,8 +142,7 @@ def _values_needed(count: int, q: float) -> int:
 def _quantile(values: Tensor, q: float, count: int | None = None) -> Tensor:
     """Return the linearly interpolated quantile of values near one of their ends, without a full sort.
 
-    `values`: [..., M], or as many of them as include `_values_needed`. `q`: quantile. `count`: M; None:
-    `values` has all.
+    `values`: [..., M], or as many as include `_values_needed`. `count`: M; None: `values` has all.
     """
     count = count or values.shape[-1]
     position = (1.0 - q if q > 0.5 else q) * (count - 1)
@@ -173,7 +165,7 @@ class PointBlocks:
     """Boxes around blocks of neighbouring points, which bound their distances from cameras.
 
     A city has millions of points and thousands of cameras. The bounds decide nearly every question about
-    their distances, so that only few of the distances themselves need to be computed.
+    their distances, so that few of these need to be computed.
     """
 
     order: Tensor  # int64 [M], the points by block: `BLOCK_POINTS` in each, and the rest in the last one

@@ -27,8 +27,7 @@ class Look:
     # "RGB"; "depth", the expected depth in the capture's unit; "alpha", the opacity; "count", how many
     # entries of its tile's list a pixel goes through; "level", RGB with a colour for each octree level.
     mode: Mode = "RGB"
-    # Spherical-harmonics degree; None: the model's. At most the model's is used.
-    sh_degree: int | None = None
+    sh_degree: int | None = None  # of spherical harmonics; None, or a higher one: the model's
     background: tuple[float, float, float] | None = None  # RGB in [0, 1]; None: the model's
     lod: bool = True  # apply the model's LOD gate, if it has one
     smooth: bool | None = None  # fade the levels of the gate; None: as the model was trained
@@ -38,10 +37,7 @@ class Look:
     far: float | None = None  # far plane; None: the model's
 
     def __post_init__(self) -> None:
-        """Check the values, which come from a browser.
-
-        ValueError: a value is impossible; the message names it.
-        """
+        """Check the values, which come from a browser (ValueError: one is impossible, by name)."""
         if self.mode not in MODES:
             raise ValueError(f"mode must be one of {', '.join(MODES)}, got {self.mode!r}")
         for name, size in (("width", self.width), ("height", self.height)):

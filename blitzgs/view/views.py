@@ -53,23 +53,15 @@ class Space:
 
     The unit is the power of two for which the scene's extent is in [1, 2). Scaling by a power of two is
     exact, so a capture that is scaled by one trains to the same bits.
-
-    Attributes:
-        offset: origin of the trained world in the capture's coordinates.
-        unit: length of one trained unit in the capture's.
-        extent: extent of the scene, in trained units.
     """
 
-    offset: tuple[float, float, float]
-    unit: float
-    extent: float
+    offset: tuple[float, float, float]  # origin of the trained world in the capture's coordinates
+    unit: float  # length of one trained unit in the capture's
+    extent: float  # extent of the scene, in trained units
 
     @classmethod
     def of(cls, offset: npt.NDArray[np.float64], extent: float) -> Space:
-        """Choose the unit for a scene of this extent (in the capture's unit).
-
-        ValueError: the extent is not positive: there are fewer than two different camera positions.
-        """
+        """Choose the unit for an extent in the capture's unit (ValueError: it is not positive)."""
         if not (math.isfinite(extent) and extent > 0):
             raise ValueError(
                 f"the extent of the scene (1.1 x the largest distance of a camera from their centre) is "
@@ -111,10 +103,7 @@ class ViewSet:
         self._device = device
 
     def size(self, indices: list[int], factor: int = 1) -> tuple[int, int]:
-        """Return the width and height that cameras share, divided by `factor` and rounded down.
-
-        ValueError: the cameras differ in size.
-        """
+        """Return the size that cameras share, divided by `factor`, rounded down (ValueError: they differ)."""
         sizes = {self._sizes[index] for index in indices}
         if len(sizes) != 1:
             raise ValueError(f"the views of a batch must share one image size, got {sorted(sizes)}")
@@ -142,10 +131,7 @@ class ViewSet:
         return centres_of(torch.from_numpy(self._viewmats[indices]))
 
     def pick(self, indices: list[int]) -> Views:
-        """Return the views of same-size cameras as one batch on the device.
-
-        ValueError: the cameras differ in size.
-        """
+        """Return the views of cameras as one batch on the device (ValueError: they differ in size)."""
         numbers = torch.empty(VIEW_NUMBERS * len(indices))
         self.write(indices, numbers.numpy())
         return unpack_views(numbers.to(self._device), *self.size(indices))

@@ -58,20 +58,15 @@ class VisibleFinder:
     """
 
     def __init__(self, gaussians: TableOrPool, lod: ModelGate | None = None) -> None:
-        """Compute the bounds of the blocks, unless a pool has them.
-
-        `gaussians`: this rank's Gaussians, without pending optimiser steps. `lod`: leaves out rows whose
-        octree level is too fine for their distance; None: no gate.
-        """
+        """Compute the bounds of blocks, unless a pool has them; no optimiser steps are pending."""
         self._gaussians, self._lod = gaussians, lod
         self._index = None if isinstance(gaussians, Pool) else BlockIndex(gaussians)
 
     def depths(self, views: Views, planes: Sequence[float], blocks: int) -> list[float]:
         """Divide the depths of one view such that about a number of blocks lies between two of them.
 
-        `views`: the view. `planes`: the near and the far plane. `blocks`: number of blocks. Returns the near
-        plane, depths in ascending order, the far plane. Only these planes if few blocks are in the view, or
-        if the Gaussians are in a pool, which bounds the memory anyway.
+        `planes`: the near and the far plane, which begin and end the result. Only these if few blocks are in
+        the view, or if the Gaussians are in a pool, which bounds the memory anyway.
         """
         near, far = planes
         if self._index is None or len(self._index.bounds) <= blocks:
@@ -93,11 +88,10 @@ class VisibleFinder:
         return [near, *sorted(depth for depth in inner if near < depth < far), far]
 
     def find(self, views: Views, limits: tuple[float, float, float], room: int | None = None) -> VisibleRows:
-        """Find the Gaussians to render for a batch of views. Collective if there is a gate.
+        """Find the Gaussians to render for at most 32 views. Collective if there is a gate.
 
-        `views`: at most 32 views. `limits`: near plane, far plane and eps2d. `room`: the lists have room for
-        so many blocks and their number tells whether that sufficed; None: for all. PoolError: the pool is too
-        small for the views.
+        `limits`: near plane, far plane and eps2d. `room`: the lists have room for so many blocks and their
+        number tells whether that sufficed; None: for all. PoolError: the pool is too small for the views.
         """
         gaussians, index = self._gaussians, self._index
         if isinstance(gaussians, Pool):

@@ -10,11 +10,11 @@ import torch
 from blitzgs import _library
 from blitzgs.frame.transport.peer import WORDS_PER_SPLAT, PeerBuffers
 from blitzgs.frame.transport.protocol import Traffic
-from blitzgs.ops.exchange import place_runs
+from blitzgs.ops.exchange import PLACE_SPLATS
 from blitzgs.ops.host import HostCopy, PinnedNumbers, current_stream
 from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.ops.projection_types import VIEW_TOTALS, Sizes, splats_of
-from blitzgs.ops.splat_gradients import SPLAT_GRADIENT
+from blitzgs.ops.rasterize import SPLAT_GRADIENT
 from tests.cuda.conftest import Scene, ops
 
 SIZES = (3000, 40, 30_000, 700)
@@ -150,7 +150,7 @@ class Rank:
         sizes, rest = Sizes(*totals[:3].tolist()), everyone[:, VIEW_TOTALS + VIEWS :]
         most = max(everyone[:, 1].max(), rest[:, ::2].sum(0).max(), rest[:, ::2].sum(1).max())
         assert plan[0] == (rest[:, 2 * self.number].sum() if most <= capacity else 0)
-        return [*splats_of(splats, sizes)[:12], places[: place_runs(sizes.splats)]]
+        return [*splats_of(splats, sizes)[:12], places[: -(-sizes.splats // PLACE_SPLATS)]]
 
 
 def exchange(counts, slack=0, capacity=None):
@@ -200,7 +200,9 @@ def test_splats_arrive_and_their_gradients_are_found(counts, slack):
         splats, masks = expected[m], sent[m][11]
         mine = zip(place.tables, its.starts, its.sent, strict=True)
         rows = [table[start : start + n] for table, start, n in mine]
-        [found] = ops.sum_splats(rows, sent[m][12][: place_runs(len(masks))], len(masks), [SPLAT_GRADIENT])
+        [found] = ops.sum_splats(
+            rows, sent[m][12][: -(-len(masks) // PLACE_SPLATS)], len(masks), [SPLAT_GRADIENT]
+        )
         times = sum((masks >> k & 1) for k in range(len(ranks)))[:, None]
         sums = [times * column for column in (splats[4], splats[5], splats[7][:, None], splats[8])]
         assert torch.equal(found[:, :9], torch.cat(sums, 1))

@@ -4,8 +4,8 @@
 import pytest
 import torch
 
-from blitzgs.ops.projection_types import VIEW_TOTALS, Sizes, WeightedViews, splats_of
-from blitzgs.ops.splat_gradients import RasterizeSaved
+from blitzgs.ops.projection_types import VIEW_TOTALS, Sizes, splats_of
+from blitzgs.ops.rasterize import RasterizeSaved
 from tests.cuda.conftest import Scene, ops, relative_error
 from tests.ops.splats import kept_by
 
@@ -64,7 +64,7 @@ def test_splat_gradients_match_float64(scene, degree, antialiased):
         *gradients, scale_reg = [t.to(device, dtype) for t in (*v, regularizer)]
         means2d, conics, depths, opacities, colors = gradients
         return ops.project_bwd(
-            inputs.gaussians, *WeightedViews(*inputs.cameras, scale_reg), *structure, None,
+            inputs.gaussians, *inputs.cameras, scale_reg, None, *structure, None,
             *inputs.options, [means2d, conics, opacities, colors], depths, True,
         )  # fmt: skip
 
@@ -89,7 +89,7 @@ def test_nothing_visible(case):
     assert splats[3].tolist() == [0]
     inputs = scene.inputs("cuda")
     gradients = ops.project_bwd(
-        inputs.gaussians, *WeightedViews(*inputs.cameras), *splats[1:4], None,
+        inputs.gaussians, *inputs.cameras, None, None, *splats[1:4], None,
         *inputs.options, [splats[i] for i in (4, 5, 7, 8)], splats.depths, True,
     )  # fmt: skip
     assert gradients[0].shape == (0, 3)

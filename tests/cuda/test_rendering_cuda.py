@@ -9,9 +9,9 @@ import torch
 import blitzgs
 from blitzgs.frame.render import backward_splats, render_frame, tile_grid
 from blitzgs.frame.transport.protocol import CapacityEstimate, LocalTransport, stages_told_to
-from blitzgs.ops import project, splat_gradients
-from blitzgs.ops.projection_types import Sizes, WeightedViews
-from blitzgs.ops.splat_gradients import gradient_columns
+from blitzgs.ops import project
+from blitzgs.ops.projection_types import Sizes
+from blitzgs.ops.rasterize import gradient_columns, gradient_table_of
 from blitzgs.table.blocks import BlockIndex, morton_order
 from blitzgs.table.table import GaussianTable
 from tests.cuda.conftest import ops
@@ -140,11 +140,11 @@ def test_gradients_of_splats_stay_in_their_table(monkeypatch):
     # The capacity exceeds the number of splats, so the table is the first part of its memory.
     scene, found = random_scene(400, cameras=1, device="cuda"), []
 
-    def gradient_table_of(columns):
-        found.append(splat_gradients.gradient_table_of(columns))
+    def noted(columns):
+        found.append(gradient_table_of(columns))
         return found[-1]
 
-    monkeypatch.setattr(project, "gradient_table_of", gradient_table_of)
+    monkeypatch.setattr(project, "gradient_table_of", noted)
     for _ in range(3):
         leaves = scene.leaves()
         renders, _, meta = blitzgs.rasterization(*leaves.arguments(), sh_degree=scene.sh_degree)
@@ -171,7 +171,7 @@ def test_packed_gradients_equal_those_from_columns(degree):
     scale_reg = torch.linspace(0.1, 0.3, 3, device="cuda")
     projection = options.projection(views)
     *expected, _ = ops.project_bwd(
-        list(table.parameters), *WeightedViews(views.viewmats, views.Ks, scale_reg),
+        list(table.parameters), views.viewmats, views.Ks, scale_reg, None,
         projected.camera_ids, projected.visible_ids, projected.splat_offsets, None, *projection,
         unpacked, None, False,
     )  # fmt: skip

@@ -20,7 +20,7 @@ from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport.collective import CollectiveTransport
 from blitzgs.frame.transport.peer import PeerTransport
 from blitzgs.frame.transport.protocol import CapacityEstimate
-from blitzgs.ops.splat_gradients import SplatGradients, gradient_columns
+from blitzgs.ops.rasterize import SplatGradients, gradient_columns
 from blitzgs.optim.table_adam import TableAdam
 from blitzgs.table.table import GaussianTable
 from tests.distributed.rank_harness import RankError, on_cuda, run_ranks

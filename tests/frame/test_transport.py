@@ -17,7 +17,7 @@ from blitzgs.ops.exchange import scatter_splats
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Sizes
-from blitzgs.ops.splat_gradients import SplatGradients
+from blitzgs.ops.rasterize import SplatGradients
 from tests.distributed.rank_harness import run_ranks
 from tests.frame.test_sharded_rendering import OPTIONS, cameras
 from tests.frame.without_gpu import Host, Memory, replace_cuda
@@ -98,7 +98,7 @@ def _round_trip(ranks, capacity):
     transport = open_transport(ranks)
     assignment = TileAssignment(ranks, ranges_for(ranks.world_size))
     exchange = transport.project_and_send(inputs, assignment, capacity)
-    got = exchange.arrived.splats
+    got = exchange.arrived
     assert exchange.gradient_table is None
     needed, result = exchange.finish()
     projected, splats, totals, visible, way_back = result
@@ -178,8 +178,7 @@ def test_memory_that_is_too_small_grows_and_the_frame_is_the_same(alone):
     def finished():
         def attempt(sizes):
             exchange = transport.project_and_send(inputs, assignment, sizes)
-            arrived, table = exchange.arrived, exchange.gradient_table
-            assert arrived.n_isects > 0 and len(arrived.splats.ids) >= len(table)
+            assert exchange.n_isects > 0 and len(exchange.arrived.ids) >= len(exchange.gradient_table)
             return exchange, exchange
 
         result, exchange = run_attempts(transport, attempt)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from blitzgs.ops.intersect import intersect, tile_counts
-from blitzgs.ops.splat_gradients import SPLAT_GRADIENT
+from blitzgs.ops.rasterize import SPLAT_GRADIENT
 from tests.helpers import on_threads, refused
 from tests.ops.splats import Splats, kept_by, pixel_alphas, random_splats, with_capacity
 

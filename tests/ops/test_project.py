@@ -12,7 +12,6 @@ from blitzgs.ops.projection_types import (
     ProjectionInputs,
     ProjectionOptions,
     Sizes,
-    WeightedViews,
 )
 from tests.helpers import (
     PARAMETERS,
@@ -164,7 +163,7 @@ def test_dense_gradients_equal_scattered_compact_ones(backend, degree, coefficie
     if sh is not None:
         gaussians, v_splats = [*gaussians, sh], [*v_splats, colors]
     arguments = (
-        gaussians, *WeightedViews(scene.viewmats, scene.Ks), splats.camera_ids, splats.visible_ids,
+        gaussians, scene.viewmats, scene.Ks, None, None, splats.camera_ids, splats.visible_ids,
         splats.splat_offsets, None, *options, v_splats, depths[:, 0], True,
     )  # fmt: skip
     compact = torch.ops.blitzgs.project_bwd(*arguments)

@@ -12,8 +12,8 @@ from blitzgs.ops.lazy_adam import (
     project_bwd_step_,
 )
 from blitzgs.ops.project import project
-from blitzgs.ops.projection_types import ProjectionOptions, WeightedViews
-from blitzgs.ops.splat_gradients import SplatGradients
+from blitzgs.ops.projection_types import ProjectionOptions
+from blitzgs.ops.rasterize import SplatGradients
 from tests.helpers import refused
 
 BETA1, BETA2, EPS = 0.9**2, 0.999**2, 1e-15 / math.sqrt(2)
@@ -63,7 +63,7 @@ class Scene:
         return [self.splats.camera_ids, self.splats.visible_ids, self.splats.splat_offsets]
 
     def views(self):
-        return WeightedViews(self.viewmats, self.Ks, self.scale_reg, self.opacity_reg)
+        return self.viewmats, self.Ks, self.scale_reg, self.opacity_reg
 
     def schedule(self):
         return AdamSchedule(self.lr_table, BETA1, BETA2, EPS, self.state.params[0].dtype)

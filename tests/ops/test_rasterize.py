@@ -9,8 +9,7 @@ import torch
 
 from blitzgs.ops.intersect import intersect, tile_counts
 from blitzgs.ops.photometric import photometric_fwd_bwd
-from blitzgs.ops.rasterize import rasterize
-from blitzgs.ops.splat_gradients import GradientBuffer, gradient_columns, gradient_table_of
+from blitzgs.ops.rasterize import GradientBuffer, gradient_columns, gradient_table_of, rasterize
 from tests.helpers import on_threads, refused
 from tests.ops.splats import Splats, by_definition, kept_by, random_splats
 from tests.ops.test_photometric import images

@@ -26,7 +26,6 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.render import RenderOptions, render_frame
-from blitzgs.ops.projection_types import WeightedViews
 from blitzgs.runs import trained_model
 from blitzgs.table.table import PARAMETERS, GaussianTable
 from blitzgs.view.views import Space, ViewSet
@@ -256,7 +255,7 @@ class DenseAdam:
         """Take a step with the gradients that the trainer's optimiser gets next."""
         splats, options = frame.projected, frame.options.projection(frame.views)
         *v, _ = torch.ops.blitzgs.project_bwd(
-            list(table.parameters), *WeightedViews(frame.views.viewmats, frame.views.Ks, scale_reg),
+            list(table.parameters), frame.views.viewmats, frame.views.Ks, scale_reg, None,
             splats.camera_ids, splats.visible_ids, splats.splat_offsets, None, *options,
             list(gradients.parts), None, False,
         )  # fmt: skip

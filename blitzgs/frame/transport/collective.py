@@ -8,7 +8,6 @@ import torch.distributed as dist
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport.protocol import (
-    Arrived,
     CapacityEstimate,
     Exchange,
     ExchangeResult,
@@ -24,11 +23,10 @@ from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, S
 class CollectiveTransport:
     """The transport for ranks that cannot access each other's memory.
 
-    The ranks exchange the numbers of splats that each sends to each other, and the host waits for these
-    numbers. Then splats are packed by rank, sent, and unpacked. Gradients return in the same way; their owner
-    adds them up in the order of the ranks, so the sum does not depend on which rank was faster. The position
-    of each splat among those sent to a rank is stored in 8 bytes per 32 splats, and is used again to return
-    the gradients.
+    The ranks exchange the numbers of splats that each sends to each other, for which the host waits. Then
+    splats are packed by rank, sent, and unpacked. Gradients return in the same way; their owner adds them up
+    in the order of the ranks. For that, the position of each splat among those sent to a rank is stored in 8
+    bytes per 32 splats.
     """
 
     def __init__(self, ranks: Ranks) -> None:
@@ -75,4 +73,4 @@ class CollectiveTransport:
             way_back = WayBack(ranks, traffic, places)
             result = ExchangeResult(own, splats, totals[ranks.rank], visible, way_back)
         stage_ended("exchange")
-        return Exchange(projected, Arrived(splats, None, traffic.n_isects), None, lambda: (needed, result))
+        return Exchange(projected, splats, None, traffic.n_isects, None, lambda: (needed, result))

@@ -49,7 +49,6 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.shared_memory import SharedMemory
 from blitzgs.frame.tiles import TileAssignment
 from blitzgs.frame.transport.protocol import (
-    Arrived,
     CapacityEstimate,
     Exchange,
     ExchangeResult,
@@ -57,22 +56,17 @@ from blitzgs.frame.transport.protocol import (
     WayBack,
     stage_ended,
 )
-from blitzgs.ops.exchange import place_runs
+from blitzgs.ops.exchange import PLACE_SPLATS
 from blitzgs.ops.host import current_stream
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats, splats_of
-from blitzgs.ops.splat_gradients import SPLAT_GRADIENT, SplatGradients
+from blitzgs.ops.rasterize import SPLAT_GRADIENT, SplatGradients
 
 # The columns of `Splats` in the order in which ranks write them (kSentColumns of csrc/exchange/transport.h):
 # dtype, words and shape of an element.
-_COLUMNS = (
-    (torch.float32, 2, (2,)),
-    (torch.float32, 3, (3,)),
-    (torch.float32, 1, ()),
-    (torch.float32, 3, (3,)),
-    (torch.float32, 1, ()),
-    (torch.int32, 1, ()),
-    (torch.int64, 2, ()),
-)
+_COLUMNS: tuple[tuple[torch.dtype, int, tuple[int, ...]], ...] = (
+    (torch.float32, 2, (2,)), (torch.float32, 3, (3,)), (torch.float32, 1, ()), (torch.float32, 3, (3,)),
+    (torch.float32, 1, ()), (torch.int32, 1, ()), (torch.int64, 2, ()),
+)  # fmt: skip
 _SPLAT_WORDS = sum(words for _, words, _ in _COLUMNS)
 WORDS_PER_SPLAT = _SPLAT_WORDS + SPLAT_GRADIENT
 # Buffers hold a multiple of this many splats, so that every column begins at a full memory transaction.
@@ -168,21 +162,19 @@ class PeerTransport:
                 fits &= traffic.most_isects <= capacity.isects and traffic.most_blocks <= capacity.blocks
             if not fits:
                 return traffic.needed, None
-            way_back = PeerWayBack(
-                ranks, traffic, places[: place_runs(traffic.own.splats)], memory, generation, buffers.tables
+            own, arrived = (
+                splats_of(projected.splats, traffic.own),
+                buffers.splats.first(sum(traffic.received)),
             )
-            return traffic.needed, ExchangeResult(
-                projected=splats_of(projected.splats, traffic.own),
-                splats=buffers.splats.first(sum(traffic.received)),
-                totals=totals()[ranks.rank],
-                visible=shared.sums[VIEW_TOTALS : VIEW_TOTALS + n_views],
-                way_back=way_back,
-            )
+            runs = places[: -(-traffic.own.splats // PLACE_SPLATS)]
+            way_back = PeerWayBack(ranks, traffic, runs, memory, generation, buffers.tables)
+            visible = shared.sums[VIEW_TOTALS : VIEW_TOTALS + n_views]
+            return traffic.needed, ExchangeResult(own, arrived, totals()[ranks.rank], visible, way_back)
 
         n_isects = Traffic.of(totals(), n_views, ranks.rank).n_isects if capacity is None else capacity.isects
         stage_ended("exchange")
-        arrived = Arrived(buffers.splats, plan[:1], n_isects)
-        return Exchange(projected, arrived, buffers.tables[ranks.rank], finish)
+        table = buffers.tables[ranks.rank]
+        return Exchange(projected, buffers.splats, plan[:1], n_isects, table, finish)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ that composite tiles which it touches, and its gradient is returned (BlitzGS, se
 frame, on every rank:
 
     exchange = transport.project_and_send(inputs, assignment, capacity)
-    exchange.arrived, exchange.gradient_table                # for compositing
+    exchange.arrived, exchange.gradient_table, ...           # for compositing
     needed, result = exchange.finish()                       # result None: the capacity was too small
     result.way_back.check_still_valid()                      # before the backward pass of compositing
     gradients = result.way_back.return_gradients(gradients)  # gradients of this rank's own splats
@@ -40,7 +40,7 @@ from blitzgs.ops.projection_types import (
 if TYPE_CHECKING:
     from blitzgs.distributed.group import Ranks
     from blitzgs.frame.tiles import TileAssignment
-    from blitzgs.ops.splat_gradients import SplatGradients
+    from blitzgs.ops.rasterize import SplatGradients
 
 
 _listener: Callable[[str], object] | None = None
@@ -70,8 +70,7 @@ class Traffic(NamedTuple):
     splats: list[list[int]]  # splats[s][d] is the number of splats that rank s sends to rank d
     sent: list[int]  # number of splats sent to each rank
     received: list[int]  # number of splats received from each rank
-    # For each rank, the position of this rank's first splat among all that the rank receives.
-    starts: list[int]
+    starts: list[int]  # for each rank, the position of this rank's first splat in what that receives
     most: int  # largest number of splats that any rank has, sends or receives
     n_isects: int  # upper bound of the tile entries of the splats received
     most_isects: int  # largest `n_isects` of any rank
@@ -104,14 +103,6 @@ class Traffic(NamedTuple):
         return Sizes(self.most, self.most, self.most_isects, self.most_blocks)
 
 
-class Arrived(NamedTuple):
-    """The splats that this rank composites."""
-
-    splats: Splats  # the splats; the columns are longer than their number if the host does not know it yet
-    n_splats: Tensor | None  # int64 [1], number of valid splats, on the device; None: all are valid
-    n_isects: int  # upper bound of the tile entries, or capacity for them; -1: they must be counted
-
-
 class ExchangeResult(NamedTuple):
     """The splats after an exchange, cut to their numbers, which the host knows by now."""
 
@@ -126,7 +117,9 @@ class Exchange(NamedTuple):
     """The exchange of one frame's splats: queued work, whose sizes the host may not know until `finish`."""
 
     projected: ProjectionOutputs  # this rank's own splats, with spare capacity if the host does not know more
-    arrived: Arrived  # the splats that this rank composites
+    arrived: Splats  # splats to composite; too long while the host does not know their number
+    n_splats: Tensor | None  # int64 [1], number of valid splats, on the device; None: all are valid
+    n_isects: int  # upper bound of the tile entries, or capacity for them; -1: they must be counted
     # Memory, [R, 12], in which the gradients of these splats must be added up, because other ranks read them
     # there; compositing must zero it. None: any memory can be used.
     gradient_table: Tensor | None
@@ -147,11 +140,7 @@ class WayBack:
     places: Tensor  # positions of this rank's own splats among those that it sent, from `scatter_splats`
 
     def check_still_valid(self) -> None:
-        """Check that gradients of this frame can still be returned.
-
-        RuntimeError: a later frame has overwritten this frame's splats, which happens only where ranks share
-        memory.
-        """
+        """Check that no later frame has overwritten this one's splats (RuntimeError: ranks share memory)."""
 
     def cleared_table(self) -> Tensor | None:
         """Zero `gradient_table` for another backward pass, when no rank reads it any more. Collective.
@@ -172,9 +161,8 @@ class WayBack:
     def return_sums(self, sums: Tensor) -> Tensor:
         """Return integer sums over the tiles of each rank to the splats' owners, and add them up. Collective.
 
-        `sums`: int64 [R, C], sums of the splats that arrived here. Returns int64 [P, C], sums of this rank's
-        own splats; zero for splats that touch no tile. Integers add up exactly, so the result does not depend
-        on the number of ranks.
+        `sums`: int64 [R, C], of the splats that arrived here. Returns int64 [P, C], of this rank's own
+        splats; zero for splats that touch no tile. Integers add up exactly, whatever the number of ranks.
         """
         traffic = self.traffic
         returned = self.ranks.all_to_all(sums, traffic.received, traffic.sent)
@@ -206,18 +194,16 @@ class Transport(Protocol):
     ) -> Exchange:
         """Project this rank's Gaussians and send the splats to the ranks that composite them. Collective.
 
-        `inputs`: inputs of the projection, with the Gaussians' ids. `assignment`: the tiles of each rank;
-        None: this rank composites all tiles. `capacity`: the sizes to allocate; None: the host first waits
-        for the numbers.
+        `inputs`: with the Gaussians' ids. `assignment`: the tiles of each rank; None: this rank composites
+        all. `capacity`: the sizes to allocate; None: the host first waits for the numbers.
         """
 
 
 class CapacityEstimate:
     """Estimates the sizes that the next frame needs from the largest recent ones. Threads may share it.
 
-    If the host waited for the sizes, the device would be idle meanwhile. Instead, the host queues all the
-    work with the estimate, and reads the true sizes while the device works. If the estimate was too small,
-    the host queues the work again (`blitzgs.frame.render`).
+    The host queues all work with the estimate and reads the true sizes while the device works; if it was too
+    small, the host queues the work again (`blitzgs.frame.render`).
     """
 
     def __init__(self, sizes: Sizes | None = None) -> None:
@@ -231,12 +217,8 @@ class CapacityEstimate:
         with self._lock:
             before = self.sizes or Sizes(0, 0, 0)
             # Views differ, so the estimate exceeds the largest recent size, and it shrinks slowly.
-            self.sizes = Sizes(
-                *[
-                    max(1, n * 9 // 8, size - size // 256)
-                    for n, size in zip(Sizes(*needed), before, strict=True)
-                ]
-            )
+            both = zip(Sizes(*needed), before, strict=True)
+            self.sizes = Sizes(*[max(1, n * 9 // 8, size - size // 256) for n, size in both])
 
 
 class LocalTransport:
@@ -258,10 +240,8 @@ class LocalTransport:
         splats, copy = projected.for_compositing, HostCopy(projected.totals)
         stage_ended("project")
         known: list[int] = [] if capacity is not None else copy.read().tolist()
-        if capacity is None:
-            arrived = Arrived(splats, None, known[2])
-        else:
-            arrived = Arrived(splats, projected.n_splats, capacity.isects)
+        n_splats = None if capacity is None else projected.n_splats
+        n_isects = known[2] if capacity is None else capacity.isects
         stage_ended("exchange")
 
         def finish() -> tuple[Sizes, ExchangeResult | None]:
@@ -271,11 +251,11 @@ class LocalTransport:
             if capacity is None:
                 own, composited = projected.splats._replace(counts=counts), splats
             elif capacity.holds(needed):
-                valid = projected.first(needed, counts)
-                own, composited = valid.splats, valid.for_compositing
+                cut = projected.first(needed, counts)
+                own, composited = cut.splats, cut.for_compositing
             else:
                 return needed, None  # the splats are undefined
             visible = projected.totals[VIEW_TOTALS:]
             return needed, ExchangeResult(own, composited, totals, visible, None)
 
-        return Exchange(projected, arrived, None, finish)
+        return Exchange(projected, splats, n_splats, n_isects, None, finish)
