@@ -210,11 +210,6 @@ def refused(error: type[Exception], text: str, call: Callable, /, *given: Any, *
         call(*given, **named)
 
 
-def opcheck_eager(op: Any, arguments: Any) -> None:
-    """Check an op that no compiled call reaches, and that has no fake kernel therefore."""
-    torch.library.opcheck(op, arguments, test_utils=("test_schema", "test_autograd_registration"))
-
-
 def relative_error(actual: Tensor, expected: Tensor) -> float:
     """Return max |actual - expected| / max |expected|; infinite for NaN or anything else not finite."""
     assert actual.shape == expected.shape, f"shapes differ: {list(actual.shape)}, {list(expected.shape)}"

@@ -16,7 +16,7 @@ from blitzgs.reference.render import contributions as by_definition
 from blitzgs.reference.render import top_mass
 from blitzgs.spawn.candidates import FEATURES, spawn_features
 from blitzgs.table.table import GaussianTable
-from tests.helpers import opcheck_eager, random_scene, refused
+from tests.helpers import random_scene, refused
 from tests.population.test_density import LEVELS, random_table
 
 
@@ -85,7 +85,9 @@ def test_parts_add_up_and_repeat(backend):
 @pytest.mark.parametrize("squares", [False, True])
 def test_opcheck(squares):
     splats, lists, _ = lists_of(random_scene(20, 1, 40, 32))
-    opcheck_eager(torch.ops.blitzgs.contributions, (*splats, *lists, 1, 40, 32, 16, 0, -1, None, squares))
+    torch.library.opcheck(
+        torch.ops.blitzgs.contributions, (*splats, *lists, 1, 40, 32, 16, 0, -1, None, squares)
+    )
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
@@ -329,7 +331,7 @@ def test_wrong_arguments():
 def test_spawn_features_opcheck():
     table, rows, is_split = candidates(9)
     names = ("grad_sum", "grad_count", "opacities", "scales", "birth", "level", "exp_avg_sq.sh")
-    opcheck_eager(
+    torch.library.opcheck(
         torch.ops.blitzgs.spawn_features,
         ([table[name] for name in names], rows, is_split, TIME, EXTENT, LEVELS),
     )

@@ -29,7 +29,7 @@ from blitzgs.ops.projection_types import Views
 from blitzgs.table.blocks import BlockIndex
 from blitzgs.table.placement import place
 from blitzgs.table.table import CULL, sectors_in
-from tests.helpers import opcheck_eager, refused
+from tests.helpers import refused
 from tests.table.test_blocks import FAR, HEIGHT, NEAR, WIDTH, make_table, make_views
 from tests.table.test_table import append
 from tests.training.tiny import random_gaussians
@@ -178,8 +178,8 @@ def test_errors_name_the_value_of_cull_mask():
 
 def test_opcheck_of_cull_mask(device):
     rows = random_rows(300, 2, device)
-    opcheck_eager(torch.ops.blitzgs.sectors_of_rows, (rows,))
-    opcheck_eager(torch.ops.blitzgs.rows_of_sectors, (sectors_of_rows(rows), 300))
+    torch.library.opcheck(torch.ops.blitzgs.sectors_of_rows, (rows,))
+    torch.library.opcheck(torch.ops.blitzgs.rows_of_sectors, (sectors_of_rows(rows), 300))
 
 
 SHAPES = [((3,), torch.float32), ((), torch.float32), ((4, 3), torch.float32), ((), torch.int64),
@@ -275,7 +275,9 @@ def test_errors_name_the_value_of_pool_ops():
 def test_opcheck_of_pool_ops():
     viewmats, Ks = make_views(2)
     bounds = BlockIndex(make_table(600)).bounds
-    opcheck_eager(torch.ops.blitzgs.seen_blocks, (bounds, viewmats, Ks, sizes_of(2, "cpu"), NEAR, FAR, 0.3))
+    torch.library.opcheck(
+        torch.ops.blitzgs.seen_blocks, (bounds, viewmats, Ks, sizes_of(2, "cpu"), NEAR, FAR, 0.3)
+    )
     lists = torch.tensor([[0], [2], [1]], dtype=torch.int32)
     torch.library.opcheck(
         torch.ops.blitzgs.swap_blocks_, (columns(512, "cpu"), columns(1024, "cpu"), 3, *lists)
@@ -360,8 +362,8 @@ def test_errors_name_the_value_of_sampling():
 
 
 def test_opcheck_of_sampling():
-    opcheck_eager(torch.ops.blitzgs.keys_up_to, (torch.rand(9), torch.tensor([3])))
+    torch.library.opcheck(torch.ops.blitzgs.keys_up_to, (torch.rand(9), torch.tensor([3])))
     torch.library.opcheck(torch.ops.blitzgs.find_digit_, (torch.tensor([0, 1, 0]), torch.tensor([1, 2])))
-    opcheck_eager(torch.ops.blitzgs.sampling_keys, (torch.rand(9), torch.arange(9), 1, 2))
+    torch.library.opcheck(torch.ops.blitzgs.sampling_keys, (torch.rand(9), torch.arange(9), 1, 2))
     prefix = torch.zeros(1, dtype=torch.int64)
-    opcheck_eager(torch.ops.blitzgs.key_histogram, (torch.rand(9), prefix, 21, 11))
+    torch.library.opcheck(torch.ops.blitzgs.key_histogram, (torch.rand(9), prefix, 21, 11))

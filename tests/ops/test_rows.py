@@ -8,7 +8,7 @@ from blitzgs.call.layout import Places
 from blitzgs.ops.derivatives import KeptMarks, distinct_rows, sparse_rows
 from blitzgs.ops.exchange import PLACE_SPLATS, gather_splats, scatter_splats
 from blitzgs.ops.projection_types import first_rows
-from tests.helpers import opcheck_eager, refused
+from tests.helpers import refused
 
 COLUMNS = [((2,), torch.float32), ((3,), torch.float64), ((), torch.int64), ((), torch.float32)]
 
@@ -93,9 +93,9 @@ def test_arrange_splats_opcheck():
     places = places_of("cpu", ordered=False)
     columns, under = [torch.randn(700, 2), torch.randn(700)], torch.randn(2, 301)
     arguments = columns, list(places.indices), list(places.shape)
-    opcheck_eager(torch.ops.blitzgs.arrange_splats, (*arguments, under))
+    torch.library.opcheck(torch.ops.blitzgs.arrange_splats, (*arguments, under))
     arranged = list(places.arrange(columns))
-    opcheck_eager(torch.ops.blitzgs.splats_of_arranged, (arranged, *arguments[1:]))
+    torch.library.opcheck(torch.ops.blitzgs.splats_of_arranged, (arranged, *arguments[1:]))
 
 
 def test_first_rows_share_their_memory(device):
@@ -238,10 +238,10 @@ def test_scatter_errors_name_the_value():
 def test_scatter_opcheck():
     ops, masks = torch.ops.blitzgs, torch.tensor([2, 0, 3])
     words = [torch.arange(6, dtype=torch.int32).view(3, 2), torch.arange(3, dtype=torch.int32).view(3, 1)]
-    opcheck_eager(ops.scatter_splats, (words, masks, [1, 2]))
+    torch.library.opcheck(ops.scatter_splats, (words, masks, [1, 2]))
     packed, places = ops.scatter_splats(words, masks, [1, 2])
-    opcheck_eager(ops.gather_splats, (packed, [2, 1], [1, 2]))
-    opcheck_eager(ops.sum_splats, (torch.randn(3, 3).split([1, 2]), places, 3, [2, 1]))
+    torch.library.opcheck(ops.gather_splats, (packed, [2, 1], [1, 2]))
+    torch.library.opcheck(ops.sum_splats, (torch.randn(3, 3).split([1, 2]), places, 3, [2, 1]))
 
 
 find_non_finite = torch.ops.blitzgs.find_non_finite

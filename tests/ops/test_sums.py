@@ -9,7 +9,7 @@ import torch
 from blitzgs.ops.importance import DIVISIONS, ViewSums, view_sums_
 from blitzgs.ops.photometric import report_
 from blitzgs.ops.population import density_stats_, tree_sums
-from tests.helpers import opcheck_eager, refused, sum_parts
+from tests.helpers import refused, sum_parts
 
 DEPTH, FEATURES, TREES = 5, 3, 9
 
@@ -76,7 +76,7 @@ def test_tree_sums_errors_name_the_value():
 
 
 def test_tree_sums_opcheck():
-    opcheck_eager(torch.ops.blitzgs.tree_sums, (torch.rand(20, 3), *tensors(*forest())))
+    torch.library.opcheck(torch.ops.blitzgs.tree_sums, (torch.rand(20, 3), *tensors(*forest())))
 
 
 N, VIEWS, WORDS = 300, 7, 2

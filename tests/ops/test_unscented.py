@@ -12,7 +12,7 @@ from blitzgs.ops.project import project_splats
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions
 from blitzgs.ops.unscented import GLOBAL_SHUTTER, Lenses, largest_angles, project_unscented
 from blitzgs.reference.projection import View, lens_pixels, sh_colors, unscented_splats
-from tests.helpers import opcheck_eager, random_scene, refused, relative_error
+from tests.helpers import random_scene, refused, relative_error
 
 BROWN = (-0.1, 0.02, 0.003, 0.01, 0.02, 0.001, 0.003, -0.004, 0.001, 0.002, -0.002, 0.003)
 FISHEYE = (0.02, -0.03, 0.01, -0.02, *[0.0] * 8)
@@ -142,12 +142,12 @@ def test_opcheck():
     given = (gaussians, scene.viewmats, scene.Ks, *lenses, *options)
     ids = torch.arange(20, dtype=torch.int32)
     index = (ids, ids % 2, torch.arange(21, dtype=torch.int32))
-    opcheck_eager(torch.ops.blitzgs.unscented_visible, given)
-    opcheck_eager(torch.ops.blitzgs.unscented_fwd, (*given, *index))
+    torch.library.opcheck(torch.ops.blitzgs.unscented_visible, given)
+    torch.library.opcheck(torch.ops.blitzgs.unscented_fwd, (*given, *index))
     columns = torch.ops.blitzgs.unscented_fwd(*given, *index)[:5]
     detached = ([g.detach() for g in gaussians], *given[1:])
     v = [torch.randn_like(column) for column in columns]
-    opcheck_eager(torch.ops.blitzgs.unscented_bwd, (*detached, *index[1:], v))
+    torch.library.opcheck(torch.ops.blitzgs.unscented_bwd, (*detached, *index[1:], v))
 
 
 def test_tiny_gaussians_without_distortion_have_the_ordinary_splats():

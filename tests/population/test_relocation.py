@@ -22,7 +22,6 @@ from blitzgs.spawn.lineage import Cause
 from blitzgs.table.table import EXP_AVG_SQS, PARAMETERS, GaussianTable, opacity_logit
 from blitzgs.view.levels import Levels, measure_levels
 from tests.distributed.rank_harness import run_ranks
-from tests.helpers import opcheck_eager
 from tests.population.test_density import LEVELS, SEED, STEP, TIME, random_table
 
 
@@ -223,11 +222,11 @@ def test_errors_and_opcheck_of_the_ops_of_relocation():
     torch.library.opcheck(torch.ops.blitzgs.share_rows_, shared)
     torch.library.opcheck(torch.ops.blitzgs.overlap, (torch.rand(3).double(), torch.tensor([1, 2, 3])))
     for key in (torch.tensor([5]), None):
-        opcheck_eager(torch.ops.blitzgs.hash_key, (rows, key, 3))
-    opcheck_eager(torch.ops.blitzgs.draw_weights, (torch.rand(3), torch.zeros(3).byte()))
-    opcheck_eager(torch.ops.blitzgs.residual_draws, (torch.arange(3), torch.arange(3), 2, 3, 4, 5))
+        torch.library.opcheck(torch.ops.blitzgs.hash_key, (rows, key, 3))
+    torch.library.opcheck(torch.ops.blitzgs.draw_weights, (torch.rand(3), torch.zeros(3).byte()))
+    torch.library.opcheck(torch.ops.blitzgs.residual_draws, (torch.arange(3), torch.arange(3), 2, 3, 4, 5))
     gone = torch.tensor([1, 300])
-    opcheck_eager(torch.ops.blitzgs.bracket_keys, (gone, gone))
+    torch.library.opcheck(torch.ops.blitzgs.bracket_keys, (gone, gone))
     matched = torch.zeros_like(gone), gone > 0, torch.arange(4), torch.arange(4), gone, gone
     torch.library.opcheck(torch.ops.blitzgs.match_brackets_, matched)
     with pytest.raises(RuntimeError, match="total must be positive, got 0"):
