@@ -94,22 +94,33 @@ class Frame(NamedTuple):
 
 def render_frame(
     table: GaussianTable,
-    views: Views,  # at most 32 views
-    options: RenderOptions,  # how to render
-    # rows to consider, and the views of each; None: all rows in all views. Or a function that finds them,
-    # given the capacity for the frame (see `run_attempts`).
+    views: Views,
+    options: RenderOptions,
     active: ActiveRows | Callable[[Sizes | None], ActiveRows] | None = None,
-    assignment: TileAssignment | None = None,  # tiles of each rank (collective); None: all are here
-    # sends the splats to the ranks that composite them; used for several frames, it estimates their sizes, so
-    # that the device need not wait for the host. None: a new one.
+    assignment: TileAssignment | None = None,
     transport: Transport | None = None,
-    backward_follows: bool = False,  # makes a backward pass faster, which also works without
-    backgrounds: Tensor | None = None,  # colours [B, 3] behind everything; None: of the options
+    backward_follows: bool = False,
+    backgrounds: Tensor | None = None,
 ) -> Frame:
     """Render views of a table whose active rows have no pending optimiser steps.
 
-    Returns the frame; its images do not depend on the order of the table's rows, on inactive rows, or on how
-    many ranks shared the work.
+    Args:
+        views: at most 32 views.
+        options: how to render.
+        active: rows to consider, and the views of each; None: all rows in all views. Or a function that finds
+            them, given the capacity for the frame (see `run_attempts`).
+        assignment: the tiles of each rank; every rank of the job calls this with its table. None: render all
+            tiles from this table alone.
+        transport: sends the splats to the ranks that composite them. A transport that is used for several
+            frames estimates the sizes of a frame from the frames before, so that the device need not wait for
+            the host; the result does not depend on it. None: a new one.
+        backward_follows: prepare for a backward pass, which is then faster; the backward pass also works
+            without.
+        backgrounds: the colour behind everything in each view, float32 [B, 3]; None: that of the options.
+
+    Returns:
+        The frame; its images do not depend on the order of the table's rows, on inactive rows, or on how many
+        ranks shared the work.
     """
     transport = transport or open_transport(None if assignment is None else assignment.ranks)
     grid = tile_grid(views, options, assignment)
@@ -260,17 +271,27 @@ class Survey(NamedTuple):
 
 def survey(
     table: GaussianTable,
-    views: Views,  # at most 32 views
-    options: RenderOptions,  # how to render; no colour is computed
-    assignment: TileAssignment | None = None,  # tiles of each rank (collective); None: all are here
-    transport: Transport | None = None,  # as for `render_frame`
-    active: ActiveRows | None = None,  # as for `render_frame`
-    squares: bool = False,  # whether to sum the squares as well
+    views: Views,
+    options: RenderOptions,
+    assignment: TileAssignment | None = None,
+    transport: Transport | None = None,
+    active: ActiveRows | None = None,
+    squares: bool = False,
 ) -> Survey:
     """Measure what each Gaussian contributes to views of a table without pending optimiser steps.
 
-    Returns the splats of this rank's Gaussians with the sums over the tiles of all ranks; the bits do not
-    depend on the number of ranks.
+    Args:
+        views: at most 32 views.
+        options: how to render; no colour is computed.
+        assignment: the tiles of each rank; every rank of the job calls this with its table. None: this rank
+            composites all tiles.
+        transport: as for `render_frame`.
+        active: as for `render_frame`.
+        squares: whether to sum the squares as well.
+
+    Returns:
+        The splats of this rank's Gaussians with the sums over the tiles of all ranks; the bits do not depend
+        on the number of ranks.
     """
     transport = transport or open_transport(None if assignment is None else assignment.ranks)
     inputs = inputs_of(table, views, options, active, colored=False)

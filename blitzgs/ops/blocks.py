@@ -72,36 +72,54 @@ def morton_keys(points: Tensor) -> Tensor:
 
 
 def update_block_bounds_(
-    # float32 [blocks, 8]: box in which the means can be, largest standard deviation, 1 when all are finite
-    bounds: Tensor,
-    ids: Tensor | None,  # int32 [U], rows that changed
-    means: Tensor,  # float32 [N, 3]
-    scales: Tensor,  # float32 [N, 3], logarithms of the standard deviations
-    pending: PendingSteps | None = None,  # `PendingSteps`; None: there are none
+    bounds: Tensor, ids: Tensor | None, means: Tensor, scales: Tensor, pending: PendingSteps | None = None
 ) -> None:
-    """Recompute the bounds of the blocks that hold the rows `ids` (None: of all blocks), in place."""
+    """Recompute the bounds of the blocks that hold the rows `ids` (None: of all blocks), in place.
+
+    Args:
+        bounds: float32 [ceil(N / 256), 8]: lowest and highest corner of where the means can be, largest
+            standard deviation, 1 when all rows are finite.
+        ids: int32 [U], rows that changed.
+        means: float32 [N, 3].
+        scales: float32 [N, 3], logarithms of the standard deviations.
+        pending: `PendingSteps`; None: there are none.
+    """
     with below_autograd():
         torch.ops.blitzgs.update_block_bounds_(bounds, ids, _rows(means, scales, pending))
 
 
 def cull_blocks(
-    bounds: Tensor,  # from `update_block_bounds_`, of the same rows
-    means: Tensor,  # float32 [N, 3]
-    scales: Tensor,  # float32 [N, 3], logarithms of the standard deviations
+    bounds: Tensor,
+    means: Tensor,
+    scales: Tensor,
     views: Views,
-    limits: tuple[float, float, float],  # near and far plane (near < z <= far), blur eps2d, px^2
-    pending: PendingSteps | None = None,  # as given to `update_block_bounds_`
-    level_ranges: Tensor | None = None,  # uint8 [blocks, 2], coarsest and finest level; for `rules`
-    # also drop what these leave out whatever steps are pending; `gate_views_` decides about the rest
+    limits: tuple[float, float, float],
+    pending: PendingSteps | None = None,
+    level_ranges: Tensor | None = None,
     rules: GateRules | None = None,
-    # room of the lists, at least 1; None: for what the views may see, for whose number the host waits
     capacity_blocks: int | None = None,
 ) -> ActiveRows:
     """Return the rows that at least one of the views (32 at most) may see; blocks outside all are not read.
 
     The set is conservative: it contains every row that projection would project, however many of its pending
     steps have been applied by then. A row is dropped from a view only if it certainly misses that view
-    (csrc/active/blocks.h). RuntimeError: as `gate_views_`.
+    (csrc/active/blocks.h).
+
+    Args:
+        bounds: from `update_block_bounds_`, of the same rows.
+        means: float32 [N, 3].
+        scales: float32 [N, 3], logarithms of the standard deviations.
+        limits: near plane, far plane (rows at z <= near or z > far are not seen), and eps2d, the blur on the
+            screen, pixels squared.
+        pending: as given to `update_block_bounds_`.
+        level_ranges: uint8 [ceil(N / 256), 2], coarsest and finest level of each block; needed for `rules`.
+        rules: also drop the rows that these rules leave out wherever their pending steps may move them;
+            `gate_views_` decides about the remaining rows. None: no rules.
+        capacity_blocks: capacity of the lists, in blocks of 256 rows, at least 1. None: exactly as many
+            blocks as the views may see; the host then waits for this number.
+
+    Raises:
+        RuntimeError: as `gate_views_`.
     """
     cameras = (views.viewmats, views.Ks, views.width, views.height)
     gate = () if rules is None else (level_ranges, *rules)
@@ -112,15 +130,17 @@ def cull_blocks(
     return ActiveRows(*found)
 
 
-def gate_views_(
-    active: ActiveRows,  # rows of the table; their views are changed in place
-    means: Tensor,  # float32 [N, 3], of which the listed rows are caught up
-    viewmats: Tensor,  # float32 [B, 4, 4], rigid, world to camera, B <= 32
-    rules: GateRules,  # which rows each view leaves out
-) -> None:
+def gate_views_(active: ActiveRows, means: Tensor, viewmats: Tensor, rules: GateRules) -> None:
     """Clear the bits of `active.views` for the (row, view) pairs that B views leave out; no row is removed.
 
-    RuntimeError: no level, finer levels that reach farther, or a column that the cull matrix lacks.
+    Args:
+        active: rows of the table; their views are changed in place.
+        means: float32 [N, 3], of which the listed rows are caught up.
+        viewmats: float32 [B, 4, 4], rigid, world to camera, B <= 32.
+        rules: which rows each view leaves out.
+
+    Raises:
+        RuntimeError: no level, finer levels that reach farther, or a column that the cull matrix lacks.
     """
     level, reach, lod_views, cull, columns = rules
     with below_autograd():
@@ -140,13 +160,15 @@ SECTOR_WORDS = BLOCK_ROWS // WORD_BITS
 
 
 @torch.no_grad()
-def sectors_of_rows(
-    rows: Tensor,  # int32 [N, words]; bit v % 32 of word v / 32 is that of column v
-) -> Tensor:
+def sectors_of_rows(rows: Tensor) -> Tensor:
     """Convert a mask from the layout by row to the layout by block and column (a column is a view).
 
-    Returns int32 [ceil(N / 256), 32 words, 8]: for each block of 256 rows and column the 32 bytes of the
-    rows' bits; bit r % 32 of word r / 32 is that of the block's row r. Rows beyond N have zeros.
+    Args:
+        rows: int32 [N, words]; bit v % 32 of word v / 32 is that of column v.
+
+    Returns:
+        int32 [ceil(N / 256), 32 words, 8]: for each block of 256 rows and column the 32 bytes of the rows'
+        bits; bit r % 32 of word r / 32 is that of the block's row r. Rows beyond N have zeros.
     """
     return torch.ops.blitzgs.sectors_of_rows(rows)
 
@@ -158,50 +180,70 @@ def rows_of_sectors(sectors: Tensor, n: int) -> Tensor:
 
 
 def seen_blocks(
-    bounds: Tensor,  # from `update_block_bounds_`
-    viewmats: Tensor,  # float32 [V, 4, 4]
-    Ks: Tensor,  # float32 [V, 3, 3]
-    sizes: Tensor,  # int32 [V, 2], width and height of each view, pixels
-    near_plane: float,  # this and the next two as in `cull_blocks`
+    bounds: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    sizes: Tensor,
+    near_plane: float,
     far_plane: float,
     eps2d: float = 0.3,
 ) -> Tensor:
-    """Return the views that may see a part of each block, int32 [blocks]: bit v is set if view v may.
+    """Return the views that may see a part of each block.
 
-    A block without the bit of a view has no row that `cull_blocks` lists for that view.
+    A block without the bit of a view has no row that `blitzgs.ops.blocks.cull_blocks` lists for that view.
+
+    `bounds`: from `update_block_bounds_`. `viewmats`, `Ks`: float32 [V, 4, 4] and [V, 3, 3]. `sizes`: int32
+    [V, 2], width and height of each of the V views, pixels. The others are the limits of `cull_blocks`.
+    Returns int32 [blocks], bit v set when view v may see a part of the block.
     """
     return torch.ops.blitzgs.seen_blocks(bounds, viewmats, Ks, sizes, near_plane, far_plane, eps2d)
 
 
 @torch.no_grad()
 def swap_blocks_(
-    pool: Sequence[Tensor],  # columns [P, ...]
-    table: Sequence[Tensor],  # the same columns [N, ...] on the host; pinned for a GPU
-    n_written: int,  # how many of the columns are written back; the others never change here
-    slots: Tensor,  # int32 [M], on the device of the pool
-    leaving: Tensor,  # int32 [M], on the same device; -1: the slot's contents are discarded
-    coming: Tensor,  # int32 [M], on the same device; -1: nothing is read into the slot
+    pool: Sequence[Tensor],
+    table: Sequence[Tensor],
+    n_written: int,
+    slots: Tensor,
+    leaving: Tensor,
+    coming: Tensor,
 ) -> None:
     """Move blocks of 256 rows between slots of a pool and a table in the memory of the host, in place.
 
     The contents of slot `slots[i]` are written to block `leaving[i]` of the table, and block `coming[i]` is
     read into the slot. One kernel does both at once, so that on CUDA it uses both directions of the bus. All
     slots must differ, and so must all leaving and coming blocks together; none of this is checked.
-    RuntimeError: columns that differ in dtype or in the shape of a row, are not contiguous or too many, or a
-    table that is not in (pinned) memory of the host.
+
+    Args:
+        pool: columns [P, ...].
+        table: the same columns [N, ...] in the memory of the host; pinned where the pool is on a GPU.
+        n_written: only the first `n_written` columns are written back; the others never change on the device.
+        slots: int32 [M], on the device of the pool.
+        leaving: int32 [M], on the same device; -1: the slot's contents are discarded.
+        coming: int32 [M], on the same device; -1: nothing is read into the slot.
+
+    Raises:
+        RuntimeError: columns that differ in dtype or in the shape of a row, are not contiguous or too many,
+            or a table that is not in (pinned) memory of the host.
     """
     torch.ops.blitzgs.swap_blocks_(list(pool), list(table), n_written, slots, leaving, coming)
 
 
 def take_rows(
-    columns: Sequence[Tensor],  # [N, ...], any dtypes
-    rows: Tensor,  # int64 [M], from 0 to N - 1; not checked
-    out: Sequence[Tensor] | None = None,  # [M, ...], contiguous, other memory, get the rows; None: new
+    columns: Sequence[Tensor], rows: Tensor, out: Sequence[Tensor] | None = None
 ) -> Sequence[Tensor]:
     """Return the rows `rows` of each column, as `column.index_select(0, rows)` does.
 
     For rows whose size is a multiple of 16 bytes, torch's op is slower, because it uses a whole block of
-    threads for each. Returns [M, ...] of each column.
+    threads for each.
+
+    Args:
+        columns: [N, ...], any dtypes.
+        rows: int64 [M], from 0 to N - 1; not checked.
+        out: [M, ...], contiguous, get the rows; they may not overlap the columns. None: new tensors.
+
+    Returns:
+        [M, ...] of each column.
     """
     if out is None:
         out = [column.new_empty((len(rows), *column.shape[1:])) for column in columns]

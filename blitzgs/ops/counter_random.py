@@ -46,38 +46,48 @@ KEY_BITS = 32
 
 
 @torch.no_grad()
-def sampling_keys(
-    weights: Tensor,  # float32 [N], >= 0; zero: an infinite key, chosen after all others
-    ids: Tensor,  # int64 [N], persistent
-    seed: int,
-    event: int,  # number that differs between draws
-) -> Tensor:
+def sampling_keys(weights: Tensor, ids: Tensor, seed: int, event: int) -> Tensor:
     """Draw keys; the k smallest are a sample without replacement, with probability proportional to weight.
 
     key = -log(u) / weight with u uniform in (0, 1) from (seed, event, id) alone (exponential races,
-    Efraimidis and Spirakis 2006). Returns float32 [N].
+    Efraimidis and Spirakis 2006).
+
+    Args:
+        weights: float32 [N], >= 0; zero gives an infinite key, never chosen while a positive one remains.
+        ids: int64 [N], persistent.
+        event: number that differs between draws.
+
+    Returns:
+        float32 [N].
     """
     return torch.ops.blitzgs.sampling_keys(weights, ids, seed, event)
 
 
 @torch.no_grad()
-def key_histogram(
-    keys: Tensor,  # float32 [N]
-    prefix: Tensor,  # int64 [1], the bits before the digit; keys with others are not counted
-    shift: int,  # number of bits after the digit
-    width: int,  # number of bits of the digit, 1 to 11
-) -> Tensor:
-    """Count keys by a digit of their bits, taken as integers in the order of the keys; int64 [2^width]."""
+def key_histogram(keys: Tensor, prefix: Tensor, shift: int, width: int) -> Tensor:
+    """Count keys by a digit of their ordered bits: 32-bit integers with the order of the keys.
+
+    Args:
+        keys: float32 [N].
+        prefix: int64 [1], the bits before the digit; keys with others are not counted.
+        shift: number of bits after the digit.
+        width: number of bits of the digit, 1 to 11.
+
+    Returns:
+        int64 [2^width].
+    """
     return torch.ops.blitzgs.key_histogram(keys, prefix, shift, width)
 
 
-def find_digit_(
-    # int64 [3], changed in place: the digits so far, as a number; how many keys are still to be found under
-    # them, from 1 on; how many have them, only written. If there are too few, the last digit is taken.
-    search: Tensor,
-    counts: Tensor,  # of the keys by their next digit, int64 [2^width]
-) -> None:
-    """Take the digit at which counts reach the number of keys that a search is still to find."""
+def find_digit_(search: Tensor, counts: Tensor) -> None:
+    """Take the digit at which counts reach the number of keys that a search is still to find.
+
+    Args:
+        search: int64 [3], changed in place: the digits so far, as a number; how many keys are still to be
+            found under them, from 1 on; and how many keys have them, which is only written. If there are too
+            few keys, the last digit is taken.
+        counts: of the keys by their next digit, int64 [2^width].
+    """
     torch.ops.blitzgs.find_digit_(search, counts)
 
 

@@ -92,7 +92,11 @@ def sparse_rows(indices: Tensor, values: Tensor, shape: torch.Size) -> Tensor:
 def full_gradients(
     ids: Tensor, gradients: Sequence[Tensor | None], shapes: Sequence[torch.Size], sparse: Sequence[bool]
 ) -> list[Tensor | None]:
-    """Return the gradients of parameters from those of their rows `ids` [U], each once; None: not needed."""
+    """Return the gradients of whole parameters from those of their rows, as sparse or dense tensors.
+
+    `ids`: int32 or int64 [U], ascending, each once. `gradients`: [U, ...] of each parameter; None: it needs
+    none. `shapes`: [N, ...] of each. `sparse`: which of the results are sparse.
+    """
     ids = ids.long()
     indices = ids[None]
 
@@ -139,14 +143,20 @@ def rows_of_tables(
 
 
 def distinct_rows(table: Tensor) -> tuple[Tensor, Tensor]:
-    """Return rows int64 [1, U], each once, and values [U, ...] of a tensor with one sparse dimension."""
+    """Return the rows int64 [1, U], each once, and the values [U, ...] of a sparse tensor.
+
+    `table`: a tensor whose only sparse dimension is the first.
+    """
     if not table.is_coalesced():
         table = table.coalesce()
     return raw_indices(table), raw_values(table)
 
 
 def of_shape(table: Tensor, shape: Sequence[int]) -> Tensor:
-    """Return a table [N, ...] with rows of another shape, (N, ...), whose gradient may be sparse."""
+    """Return a table with rows of another shape and as many values, whose gradient may be sparse.
+
+    `table`: [N, ...]. `shape`: (N, ...).
+    """
 
     def back(_needed: Any, v: Sequence[Tensor | None]) -> list[Tensor | None]:
         if v[0] is None or not v[0].is_sparse:

@@ -29,23 +29,33 @@ class ViewSums(NamedTuple):
 
 @torch.no_grad()
 def view_sums_(
-    sums: ViewSums,  # changed in place
-    # visible_ids int32 [U] and splat_offsets int32 [U + 1] (the Gaussians, each once, and the splats of
-    # each), camera_ids int32 [P], radii int32 [P, 2]
+    sums: ViewSums,
     splats: tuple[Tensor, Tensor, Tensor, Tensor],
-    weights: Tensor,  # int64 [P], in units of 2^-32
-    pixels: Tensor,  # int32 [P]
-    counts: Tensor,  # bool [P], whether the Gaussian counts in the splat's view
-    columns: Sequence[int],  # the views' columns in the cull matrix
+    weights: Tensor,
+    pixels: Tensor,
+    counts: Tensor,
+    columns: Sequence[int],
     *,
-    rule: str,  # score rule, a key of `DIVISIONS`
-    eps: float,  # added to the number of pixels
-    unit: float,  # unit of the score; division by a power of two is exact
+    rule: str,
+    eps: float,
+    unit: float,
 ) -> None:
     """Add the splats of at most 32 views to the sums.
 
     A splat adds ``round(w / (pixels + eps)^p / unit)`` to its Gaussian's score, where w is its weight (in
     units of 1) and p is 1 for "density" (BlitzGS, section 3.2), 1/2 for "root" and 0 for "weight".
+
+    Args:
+        sums: changed in place.
+        splats: visible_ids int32 [U] and splat_offsets int32 [U + 1] (the Gaussians, each once, and the
+            splats of each), camera_ids int32 [P], radii int32 [P, 2].
+        weights: int64 [P], in units of 2^-32.
+        pixels: int32 [P].
+        counts: bool [P], whether the Gaussian counts in the splat's view.
+        columns: the views' columns in the cull matrix.
+        rule: score rule, a key of `DIVISIONS`.
+        eps: added to the number of pixels.
+        unit: unit of the score; division by a power of two is exact.
     """
     torch.ops.blitzgs.view_sums_(
         list(sums), list(splats), weights, pixels, counts, list(columns), DIVISIONS[rule], eps, unit

@@ -61,16 +61,18 @@ class AdamSchedule(AdamTables):
     table: Tensor
 
     def __init__(
-        self,
-        # float32 [S + 1, 6], learning rates of means, quats, scales, opacities, SH DC and SH rest for every
-        # step of the schedule (row 0 unused). It must not change afterwards.
-        lr_table: Tensor,
-        beta1: float,  # decay of the first moment, 0 <= beta1 < sqrt(beta2)
-        beta2: float,  # decay of the second moment, in (0, 1)
-        eps: float,  # as the attribute
-        dtype: torch.dtype = torch.float32,  # of the parameters
+        self, lr_table: Tensor, beta1: float, beta2: float, eps: float, dtype: torch.dtype = torch.float32
     ) -> None:
-        """Make the tables (ValueError: decay rates outside their range)."""
+        """Make the tables (ValueError: decay rates outside their range).
+
+        Args:
+            lr_table: float32 [S + 1, 6], learning rates of means, quats, scales, opacities, SH DC and SH rest
+                for every step of the schedule (row 0 unused). It must not change afterwards.
+            beta1: decay of the first moment, 0 <= beta1 < sqrt(beta2).
+            beta2: decay of the second moment, in (0, 1).
+            eps: as the attribute.
+            dtype: of the parameters.
+        """
         self.betas, self.eps = (beta1, beta2), eps
         self.explicit_steps = explicit_steps(beta1, beta2, dtype)
         self._take(_make_table(lr_table, beta1, beta2), lr_table, dtype)
@@ -126,13 +128,21 @@ class GrowingSchedule(AdamTables):
 
     def step_(
         self,
-        state: list[Tensor],  # of N rows
-        taken: Tensor,  # the number of steps taken, float32 [] on the CPU
-        gradient: Tensor,  # that of the rows, [U, ...]
-        rows: Tensor | None,  # int32 [U] or int64 [1, U], each once; None: all
-        rates: tuple[float, float],  # of this step, for the first three values of a row and for the rest
+        state: list[Tensor],
+        taken: Tensor,
+        gradient: Tensor,
+        rows: Tensor | None,
+        rates: tuple[float, float],
     ) -> None:
-        """Take the next step, as `lazy_adam_step_` does."""
+        """Take the next step, as `lazy_adam_step_` does.
+
+        Args:
+            state: of N rows.
+            taken: the number of steps taken, float32 [] on the CPU.
+            gradient: that of the rows, [U, ...].
+            rows: int32 [U] or int64 [1, U], each once; None: all.
+            rates: the learning rates of this step, for the first three values of a row and for the rest.
+        """
         constants = self.constants(self.row + 1)
         with below_autograd():
             torch.ops.blitzgs.lazy_adam_step_(
@@ -151,17 +161,20 @@ class GrowingSchedule(AdamTables):
 
 
 def lazy_adam_step_(
-    state: AdamState,  # of N rows; `last_step` and `moment_step` become `step` for `ids`
-    schedule: AdamTables,  # of S steps, for the dtype of the parameters
-    step: int,  # 1 <= step <= S
-    grads: Sequence[Tensor],  # gradients of the listed rows, shaped like the parameters with U rows
-    ids: Tensor | None,  # int32 or int64 [U], the rows, each once; None: all
+    state: AdamState, schedule: AdamTables, step: int, grads: Sequence[Tensor], ids: Tensor | None
 ) -> None:
     """Take Adam step ``step`` for the rows `ids`, in place, after the zero-gradient steps they skipped.
 
     Equals ``torch.optim.Adam`` (bias-corrected; Kingma & Ba 2015, Algorithm 1) over all rows, with zero
     gradients for the rows not listed, once `lazy_adam_catch_up_` has been called; see
     csrc/adam/lazy_adam.h for the closed form. All tensors on one device; float32 (CPU also float64).
+
+    Args:
+        state: of N rows; `last_step` and `moment_step` become `step` for `ids`.
+        schedule: of S steps, for the dtype of the parameters.
+        step: 1 <= step <= S.
+        grads: gradients of the listed rows, shaped like the parameters with U rows.
+        ids: int32 or int64 [U], the rows, each once; None: all.
     """
     with below_autograd():
         torch.ops.blitzgs.lazy_adam_step_(
@@ -170,17 +183,20 @@ def lazy_adam_step_(
 
 
 def lazy_adam_catch_up_(
-    state: AdamState,  # of N rows
-    schedule: AdamTables,  # of S steps, for the dtype of the parameters
-    step: int,  # 0 <= step <= S; 0: nothing to do
-    ids: Tensor | None = None,  # int32 or int64 [A], the rows, each once; None: all
-    count: Tensor | None = None,  # int32 [1], only so many `ids` are rows, the first ones; None: all
+    state: AdamState, schedule: AdamTables, step: int, ids: Tensor | None = None, count: Tensor | None = None
 ) -> None:
     """Apply the missed zero-gradient steps up to ``step`` to the rows `ids` (None: all), in place.
 
     Only parameters and `last_step` change. Afterwards these parameters are those of dense Adam after
     ``step``. Rows that are current already do not change. The next step with a gradient applies the pending
     decay of the moments, beta^(step - moment_step).
+
+    Args:
+        state: of N rows.
+        schedule: of S steps, for the dtype of the parameters.
+        step: 0 <= step <= S; 0: nothing to do.
+        ids: int32 or int64 [A], the rows, each once; None: all.
+        count: int32 [1], only the first `count` of `ids` are rows; the host does not wait for it. None: all.
     """
     with below_autograd():
         torch.ops.blitzgs.lazy_adam_catch_up_(
@@ -195,13 +211,21 @@ def explicit_steps(beta1: float, beta2: float, dtype: torch.dtype) -> int:
     return 1 if ratio == 0 else max(1, math.ceil(math.log(negligible) / math.log(ratio)))
 
 
-def table_without_rates(
-    steps: int,  # S + 1
-    beta1: float,  # decay of the first moment, 0 <= beta1 < sqrt(beta2)
-    beta2: float,  # decay of the second moment, in (0, 1)
-    before: int = 0,  # number of steps taken before the table begins; bias corrections count from there
-) -> Tensor:
-    """Return `AdamSchedule.table` for rates of zero, on the CPU (ValueError: decay rates out of range)."""
+def table_without_rates(steps: int, beta1: float, beta2: float, before: int = 0) -> Tensor:
+    """Return `AdamSchedule.table` for learning rates of zero: only the columns that do not depend on them.
+
+    Args:
+        steps: S + 1.
+        beta1: decay of the first moment, 0 <= beta1 < sqrt(beta2).
+        beta2: decay of the second moment, in (0, 1).
+        before: number of steps taken before the table begins; bias corrections count from there.
+
+    Returns:
+        float64 [S + 1, 30] on the CPU.
+
+    Raises:
+        ValueError: decay rates outside their range.
+    """
     if not (beta1 >= 0 and 0 < beta2 < 1 and beta1 < math.sqrt(beta2)):
         raise ValueError(
             f"Adam's decay rates must satisfy 0 <= beta1 < sqrt(beta2) < 1, got beta1={beta1}, beta2={beta2}"
@@ -237,22 +261,33 @@ def _make_table(lr_table: Tensor, beta1: float, beta2: float) -> Tensor:
 
 
 def project_bwd_step_(
-    state: AdamState,  # parameters before their activation; float32 or (CPU) float64
-    schedule: AdamSchedule,  # of S steps, for the dtype of the parameters
-    step: int,  # 1 <= step <= S
-    # viewmats and Ks of the splats, and weights per view, [B], of the smallest axis and of the opacity of
-    # each Gaussian visible in it (before antialiased splats are compensated); None: no such term
+    state: AdamState,
+    schedule: AdamSchedule,
+    step: int,
     views: tuple[Tensor, Tensor, Tensor | None, Tensor | None],
-    splats: ProjectedSplats,  # the P splats that `project` returned for these parameters and views
-    options: ProjectionOptions,  # of the projection; parameters are taken before their activation
+    splats: ProjectedSplats,
+    options: ProjectionOptions,
     gradients: SplatGradients,
-    level: Tensor | None = None,  # uint8 [N], octree levels, if opacities fade with them (`options.fade`)
+    level: Tensor | None = None,
 ) -> None:
     """Take Adam step ``step`` for the visible Gaussians, in place, with the gradients of their splats.
 
     The result is that of the backward pass of `blitzgs.ops.project.project` followed by `lazy_adam_step_`, to
     rounding. On CUDA the gradients of the parameters are never stored. The parameters of the visible
     Gaussians must be at ``step`` - 1 (`lazy_adam_catch_up_`), as when they were projected.
+
+    Args:
+        state: parameters before their activation, float32 or (CPU) float64, and their moments; `last_step`
+            and `moment_step` become `step` for the visible Gaussians.
+        schedule: of S steps, for the dtype of the parameters.
+        step: 1 <= step <= S.
+        views: viewmats [B, 4, 4] and Ks [B, 3, 3] of the splats, and weights per view, [B], of the smallest
+            axis and of the opacity of each Gaussian visible in it (before antialiased splats are
+            compensated); None: no such term.
+        splats: the P splats that `project` returned for these parameters and views.
+        options: the options of the projection; scales and opacities are taken before their activation.
+        gradients: of the splats.
+        level: uint8 [N], octree levels, if opacities fade with them (`options.fade`).
     """
     with below_autograd():
         torch.ops.blitzgs.project_bwd_step_(

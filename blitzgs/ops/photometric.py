@@ -14,15 +14,21 @@ from blitzgs.ops.derivatives import first_only
 
 
 def photometric_loss(
-    renders: Tensor,  # x [B, H, W, 3], float32 (CPU also float64), nominal range [0, 1]
-    targets: Tensor,  # y [B, H, W, 3], uint8 (value / 255) or the dtype of `renders`
-    masks: Tensor | None = None,  # [B, H, W], bool or uint8, 0 = excluded; windows still read it
-    ssim_weight: float = 0.2,  # w in [0, 1]
+    renders: Tensor, targets: Tensor, masks: Tensor | None = None, ssim_weight: float = 0.2
 ) -> Tensor:
     """Return ``(1 - w) mean |x - y| + w (1 - mean SSIM)`` of each view; differentiable in `renders`.
 
     Means are over the unmasked pixels and the channels of a view; a view with no such pixel has loss 0.
-    Returns [B], dtype of `renders`.
+
+    Args:
+        renders: x [B, H, W, 3], float32 (CPU also float64), nominal range [0, 1].
+        targets: y [B, H, W, 3], uint8 (value / 255) or the dtype of `renders`.
+        masks: [B, H, W], bool or uint8, 0 = excluded; windows centred at other pixels still read such a
+            pixel.
+        ssim_weight: w in [0, 1].
+
+    Returns:
+        [B], dtype of `renders`.
     """
     l1, ssim_sums = photometric_sums(renders, targets, masks)
     counts = pixel_counts(renders, masks)
@@ -54,16 +60,16 @@ def photometric_fwd_bwd(
     renders: Tensor,
     targets: Tensor,
     masks: Tensor | None,
-    l1_weights: Tensor,  # [B], weight of each view's L1 sum, dtype of `renders`
-    ssim_weights: Tensor,  # [B], weight of each view's SSIM sum
-    tile_size: int = 16,  # edge of a tile in pixels
-    tile_begin: int = 0,  # first owned tile
-    tile_end: int = -1,  # one past the last owned tile; -1: all
+    l1_weights: Tensor,
+    ssim_weights: Tensor,
+    tile_size: int = 16,
+    tile_begin: int = 0,
+    tile_end: int = -1,
     *,
-    samples: Tensor | None = None,  # [B], divisors of the weights, dtype of `renders`; None: 1
-    visible: Tensor | None = None,  # int64 [B], number of Gaussians visible in each view
-    scale_weight: float = 0.0,  # weight of the mean smallest axis of a view's visible Gaussians
-    opacity_weight: float = 0.0,  # weight of the mean opacity of the views' visible Gaussians
+    samples: Tensor | None = None,
+    visible: Tensor | None = None,
+    scale_weight: float = 0.0,
+    opacity_weight: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the sums of `photometric_sums` and the gradient of their weighted total, without autograd.
 
@@ -76,9 +82,23 @@ def photometric_fwd_bwd(
     For the loss of `photometric_loss`, summed over views: ``l1_weights = 1 - w``, ``ssim_weights = -w`` and
     ``samples = pixel_counts(renders, masks)``.
 
-    Returns (sums float64 [B, K, 2] in K parts, v_renders [B, H, W, 3], undefined beyond the owned pixels,
-    ``scale_weight / max(visible, 1)`` [B], ``opacity_weight / (B max(visible, 1))`` [B]; the last two are [0]
-    without `visible`, and zeros if the images have no pixels).
+    Args:
+        l1_weights: [B], weight of each view's L1 sum, dtype of `renders`.
+        ssim_weights: [B], weight of each view's SSIM sum.
+        tile_size: edge of a tile in pixels.
+        tile_begin: first owned tile.
+        tile_end: one past the last owned tile; -1: all.
+        samples: [B], divisors of the weights, dtype of `renders`; None: 1.
+        visible: int64 [B], number of Gaussians visible in each view.
+        scale_weight: weight of L_scale, a view's mean smallest axis of its visible Gaussians; only used to
+            return the weight of a single Gaussian's axis.
+        opacity_weight: weight of L_opacity, the mean over the views of the mean opacity of their visible
+            Gaussians; only used to return the weight of a single Gaussian's opacity.
+
+    Returns:
+        (sums float64 [B, K, 2] in K parts, v_renders [B, H, W, 3], undefined beyond the owned pixels,
+        ``scale_weight / max(visible, 1)`` [B], ``opacity_weight / (B max(visible, 1))`` [B]; the last two
+        are [0] without `visible`, and zeros if the images have no pixels).
     """
     with below_autograd():
         return torch.ops.blitzgs.photometric_fwd_bwd(
@@ -112,15 +132,23 @@ torch.library.register_autograd("blitzgs::photometric_fwd", _backward, setup_con
 
 
 def report_(
-    parts: Tensor | None,  # float64 [B, K, 2], of `photometric_fwd_bwd`; None: no views
-    tile_work: Tensor | None,  # int32 [T], of `rasterize_fwd`; None: no tiles
-    tiles: tuple[int, int],  # this rank's [first, one past last)
-    rank: int,  # this rank
-    n_ranks: int,  # M
-    targets: Sequence[Tensor],  # float32 [2 M B + T] each, on this device or a peer of it
+    parts: Tensor | None,
+    tile_work: Tensor | None,
+    tiles: tuple[int, int],
+    rank: int,
+    n_ranks: int,
+    targets: Sequence[Tensor],
 ) -> None:
     """Write this rank's part of the report into all targets.
 
     A target has the loss sums of the M ranks, [M, 2, B], and then the work of the T tiles.
+
+    Args:
+        parts: float64 [B, K, 2], of `blitzgs.ops.photometric.photometric_fwd_bwd`; None: no views.
+        tile_work: int32 [T], of `rasterize_fwd`; None: no tiles.
+        tiles: this rank's [first, one past last).
+        rank: this rank.
+        n_ranks: M.
+        targets: float32 [2 M B + T] each, on this device or in peer-accessible memory of other devices.
     """
     torch.ops.blitzgs.report_(parts, tile_work, *tiles, rank, n_ranks, targets)

@@ -52,17 +52,22 @@ def largest_angles(radial: Tensor) -> Tensor:
     return angles.squeeze(-1).to(radial.dtype)
 
 
-def project_unscented(
-    inputs: ProjectionInputs,  # of the projection; `active`, `ids`, `level` and `options.fade` are not read
-    lenses: Lenses,  # of its views
-) -> ProjectedSplats:
+def project_unscented(inputs: ProjectionInputs, lenses: Lenses) -> ProjectedSplats:
     """Project Gaussians by the unscented transform (3DGUT, Wu et al. 2025; csrc/project/unscented.h).
 
     A Gaussian has a splat if some of its sigma points (all, if so asked) are valid, and else by the rules of
-    `blitzgs.ops.project.project`. Differentiable, once, in the Gaussians; viewmats get no gradient. Every
-    Gaussian is projected into every view, and the host waits for the number of splats. Returns splats as
-    `blitzgs.ops.project.project` returns them. RuntimeError: an argument has a wrong shape, dtype or value;
-    the message names it.
+    `blitzgs.ops.project.project`. Differentiable, once, in the Gaussians; viewmats get no gradient.
+    Every Gaussian is projected into every view, and the host waits for the number of splats.
+
+    Args:
+        inputs: of the projection; `active`, `ids`, `level` and `options.fade` are not read.
+        lenses: of its views.
+
+    Returns:
+        Splats as `blitzgs.ops.project.project` returns them.
+
+    Raises:
+        RuntimeError: an argument has a wrong shape, dtype or value; the message names it.
     """
     given = (inputs.gaussians, *inputs.cameras, *lenses, *inputs.options[: N_OPTIONS - 1])
     seen = torch.ops.blitzgs.unscented_visible(*given)

@@ -62,27 +62,40 @@ class DensityReport:
 
 
 def densify(
-    table: GaussianTable,  # changed in place; the rows are those of `placement.place`
+    table: GaussianTable,
     rules: DensityRules,
     *,
-    time: int,  # time of the event, in images
-    step: int,  # the latest optimiser step; new rows are current up to it
+    time: int,
+    step: int,
     seed: int,
-    level_count: int,  # number of octree levels K; levels of children stay below it
-    ranks: Ranks,  # the job, whose tables together are the population; every rank calls this
-    extent: float = 1.0,  # of the scene, in the unit of the means, for the candidates' features
-    veto: Veto | None = None,  # returns which candidates are withheld; None: none are
-    lineage: Lineage | None = None,  # logs births and deaths, or None
-    pending: Pending | None = None,  # pending steps of the table, which candidates take; None: none
+    level_count: int,
+    ranks: Ranks,
+    extent: float = 1.0,
+    veto: Veto | None = None,
+    lineage: Lineage | None = None,
+    pending: Pending | None = None,
 ) -> DensityReport:
     """Run one density event, and reset the statistics that it used.
 
     A candidate is a Gaussian with at least `min_observations` gradients whose mean, `grad_sum / grad_count`,
-    reaches the threshold. A small candidate gets a copy; a large one is replaced by two children that are
-    drawn from it and are 1.6 times smaller (Kerbl et al. 2023, section 5), one octree level finer. New rows
-    have the parent's phi and cull row, and moments of zero. Ids and random positions depend only on the
-    parent's id, `time` and the child's slot. Pruning applies to old and new rows; a new row has no screen
-    radius yet.
+    reaches the threshold. A small candidate gets a copy. A large one is replaced by two children that are
+    drawn from it and are 1.6 times smaller (Kerbl et al. 2023, section 5). A copy has its parent's octree
+    level, a child of a split the next one. Both have the parent's phi and cull row, and moments of zero.
+    Their ids and random positions depend only on the parent's id, `time` and the child's slot, so the result
+    does not depend on the order of the rows.
+
+    Pruning applies to old and new rows; a new row has no screen radius yet.
+
+    Args:
+        table: changed in place; the rows are those of `placement.place`.
+        time: time of the event, in images.
+        step: the latest optimiser step; new rows are current up to it.
+        level_count: number of octree levels K; levels of children stay below it.
+        ranks: the job, whose tables together are the population; every rank calls this.
+        extent: extent of the scene, in the unit of the means; only used for the candidates' features.
+        veto: returns which candidates are withheld; None: none are.
+        lineage: logs births and deaths, or None.
+        pending: the table's pending steps, of which the candidates take theirs; None: there are none.
     """
     gradient = table["grad_sum"] / table["grad_count"].clamp(min=1)
     candidates = (gradient >= rules.grad_threshold) & (table["grad_count"] >= rules.min_observations)
@@ -137,6 +150,8 @@ def cap_opacities(table: GaussianTable, opacity: float) -> None:
     """Cap the opacities of all rows and set the moments of all opacities to zero; no step may be pending.
 
     This is the opacity reset of 3DGS (Kerbl et al. 2023, section 5.2).
+
+    `table`: changed in place. `opacity`: the cap, in (0, 1).
     """
     table["opacities"].clamp_(max=opacity_logit(opacity))
     table["exp_avg.opacities"].zero_()

@@ -78,19 +78,24 @@ class Importance:
 
 
 def sweep(
-    gaussians: TableOrPool,  # this rank's, without pending optimiser steps
-    batches: Iterable[ViewBatch],  # the views, each once, in the same batches on every rank
-    n_views: int,  # V, columns of the cull matrix
+    gaussians: TableOrPool,
+    batches: Iterable[ViewBatch],
+    n_views: int,
     options: RenderOptions,
     ranks: Ranks,
-    owners: TileOwners | None = None,  # divides the tiles by their costs; the result does not depend on it
-    rule: ScoreRule = "density",  # of the score
-    lod: ModelGate | None = None,  # leaves Gaussians out of views, where they hide nothing either
-    stops: Callable[[], bool] | None = None,  # asked before a batch; the same on every rank
+    owners: TileOwners | None = None,
+    rule: ScoreRule = "density",
+    lod: ModelGate | None = None,
+    stops: Callable[[], bool] | None = None,
 ) -> Importance:
     """Score the Gaussians by their contributions to V views. Collective: every rank calls it.
 
-    SweepStoppedError: `stops` said so; the table is as it was.
+    `gaussians`: this rank's, without pending optimiser steps. `batches`: the views, each once, in the same
+    batches on every rank. `n_views`: V, columns of the cull matrix. `owners`: divides the tiles by their
+    costs; the result does not depend on it. `rule`: of the score. `lod`: leaves Gaussians out of views as
+    rendering does; there they contribute nothing and hide nothing. `stops`: whether to give up, asked before
+    each batch but the first; the same answer on every rank. SweepStoppedError: `stops` said so; the table is
+    as it was.
     """
     table = table_of(gaussians)
     sums = _Sums(len(table), n_views, table.device, rule)
@@ -208,31 +213,40 @@ def _all_culled(n_views: int, device: torch.device) -> Tensor:
     return torch.from_numpy(words)[None].to(device)
 
 
-def sample_by_score(
-    score: Tensor,  # float32 [N_rank], >= 0
-    ids: Tensor,  # int64 [N_rank], persistent
-    keep: float,  # share of all ranks' N Gaussians, in [0, 1]; its decimal value counts
-    seed: int,
-    event: int,  # number that differs between draws, such as the time of the pass
-    ranks: Ranks,  # the job; every rank calls this
-) -> Tensor:
+def sample_by_score(score: Tensor, ids: Tensor, keep: float, seed: int, event: int, ranks: Ranks) -> Tensor:
     """Draw the Gaussians that pass 1 keeps: without replacement, with probability proportional to score.
 
     The Gaussians with the floor(keep N) smallest values of -log(u) / score are kept (exponential races,
     Efraimidis and Spirakis 2006), where u depends only on (seed, event, id). A Gaussian with score zero is
-    kept only if all with positive scores are. Returns bool [N_rank], the same ids at every world size.
+    kept only if all with positive scores are.
+
+    Args:
+        score: float32 [N_rank], >= 0.
+        ids: int64 [N_rank], persistent.
+        keep: share of all ranks' N Gaussians, in [0, 1]; its decimal value counts.
+        event: number that differs between draws, such as the time of the pass.
+        ranks: the job; every rank calls this.
+
+    Returns:
+        bool [N_rank], the same ids at every world size.
     """
     return smallest(sampling_keys(score, ids, seed, event), ids, _share_of_all(keep, score, ranks), ranks)
 
 
-def top_by_score(
-    score: Tensor,  # float32 [N_rank], finite, >= 0
-    ids: Tensor,  # int64 [N_rank], persistent; they decide between equal scores
-    mass: float,  # the shortest prefix that holds this share of the score of all ranks, in [0, 1]
-    keep: float,  # but at most floor(keep N) of all ranks' N Gaussians; its decimal value counts
-    ranks: Ranks,  # the job; every rank calls this
-) -> Tensor:
-    """Choose what pass 2 keeps, bool [N_rank], the same ids at any world size: the best by score."""
+def top_by_score(score: Tensor, ids: Tensor, mass: float, keep: float, ranks: Ranks) -> Tensor:
+    """Choose the Gaussians that pass 2 keeps: a prefix of the order by descending score.
+
+    Args:
+        score: float32 [N_rank], finite, >= 0.
+        ids: int64 [N_rank], persistent; they decide between equal scores.
+        mass: the prefix is the shortest that holds this share of the total score of all ranks, in [0, 1].
+        keep: the prefix has at most floor(keep N) of all ranks' N Gaussians; in [0, 1], its decimal value
+            counts.
+        ranks: the job; every rank calls this.
+
+    Returns:
+        bool [N_rank], the same ids at every world size.
+    """
     kept = mass_prefix(score, ids, mass, ranks)
     if keep < 1:
         kept &= smallest(-score, ids, _share_of_all(keep, score, ranks), ranks)

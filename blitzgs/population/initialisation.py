@@ -37,12 +37,16 @@ class FirstGaussians:
 
     def table(
         self,
-        sh_degree: int,  # highest degree of the table
-        opacity: float,  # of all of them, in (0, 1)
+        sh_degree: int,
+        opacity: float,
         device: torch.device | str = "cpu",
-        part: slice = slice(None),  # noqa: B008  (which of them the table gets)
+        part: slice = slice(None),  # noqa: B008  (a slice cannot be changed)
     ) -> GaussianTable:
-        """Make a table of them, without rotation; ids count from 0."""
+        """Make a table of them, without rotation; ids count from 0.
+
+        `sh_degree`: highest degree of the table. `opacity`: of all of them, in (0, 1). `part`: which of them
+        the table gets.
+        """
         means = self.means[part].to(device)
         sh = torch.zeros(len(means), (sh_degree + 1) ** 2, 3, device=device)
         sh[:, 0] = self.colors[part].to(device)
@@ -58,13 +62,11 @@ class FirstGaussians:
 
 
 def octree_gaussians(
-    points: Tensor,  # SfM points, float64 [M, 3], on any device
-    colors: Tensor,  # their colours, uint8 [M, 3]
-    centres: Tensor,  # camera centres, float64 [V, 3]
-    levels: Levels,  # from `measure_levels` on the same points and cameras
-    visible_threshold: float,  # a voxel's level is resolvable in more than this share of cameras
-    # largest number of Gaussians. Whole levels are kept, from the coarsest on, and of the first level that
-    # does not fit a random part. 0: no limit.
+    points: Tensor,
+    colors: Tensor,
+    centres: Tensor,
+    levels: Levels,
+    visible_threshold: float,
     most: int = 0,
     seed: int = 0,
 ) -> FirstGaussians:
@@ -74,7 +76,20 @@ def octree_gaussians(
     (Kerbl et al. 2023).
 
     A Gaussian sits at its voxel's centre with the mean colour of the points inside and the mean distance of
-    its 3 nearest neighbours as its size. ValueError: no voxel is left.
+    its 3 nearest neighbours as its size.
+
+    Args:
+        points: SfM points, float64 [M, 3], on any device.
+        colors: their colours, uint8 [M, 3].
+        centres: camera centres, float64 [V, 3].
+        levels: from `measure_levels` on the same points and cameras.
+        visible_threshold: a voxel is kept when its level is resolvable in more than this share of the
+            cameras.
+        most: largest number of Gaussians. Whole levels are kept, from the coarsest on, and of the first level
+            that does not fit a random part. 0: no limit.
+
+    Raises:
+        ValueError: no voxel is left.
     """
     # The lower corner of the grids: below all points, unless outliers overflow the finest grid.
     reach = levels.voxel_size_of(levels.count - 1) * 2 ** (CELL_BITS - 1)

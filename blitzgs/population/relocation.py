@@ -38,28 +38,45 @@ from blitzgs.table.table import GaussianTable, opacity_logit
 
 @torch.no_grad()
 def relocate(
-    table: GaussianTable,  # changed in place; the rows are those of `placement.place`
-    rules: DensityRules,  # thresholds for dead Gaussians, and the limit of the population
+    table: GaussianTable,
+    rules: DensityRules,
     *,
-    growth: float,  # share of the population that the event adds
-    time: int,  # time of the event, in images
-    step: int,  # the latest optimiser step; new rows are current up to it
+    growth: float,
+    time: int,
+    step: int,
     seed: int,
-    ranks: Ranks,  # the job, whose tables together are the population; every rank calls this
-    extent: float = 1.0,  # of the scene, in the unit of the means, for the lineage's features
-    level_count: int = 1,  # number of octree levels; only used for the lineage's features
-    lineage: Lineage | None = None,  # logs births and deaths, or None
-    pending: Pending | None = None,  # pending steps of the table, which sources take; None: none
+    ranks: Ranks,
+    extent: float = 1.0,
+    level_count: int = 1,
+    lineage: Lineage | None = None,
+    pending: Pending | None = None,
 ) -> DensityReport:
-    """Replace dead Gaussians by copies of live ones, and let the population grow (3DGS-MCMC, section 3.4).
+    """Replace dead Gaussians by copies of live ones, and let the population grow.
 
     Dead Gaussians are those that density control would prune. The number of copies is that of the dead plus
-    the share `growth` of the population. Live Gaussians are drawn for copying in proportion to their opacity.
-    A Gaussian and its copies have one position, and share opacity and size such that together they look like
-    the Gaussian before (`shared_among_copies`). It keeps its moments, scaled as its gradients are
-    (`share_rows_`); copies begin with moments of zero and without statistics, and have its level, phi and
-    cull row. Draws and ids depend only on (seed, time, id). In the report, `cloned` is the number of all
-    copies on this rank, `relocated` that of the dead they replace.
+    the share `growth` of the population. Live Gaussians are drawn for copying in proportion to their opacity
+    (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo", section 3.4). A Gaussian and
+    its copies have one position, and share opacity and size such that together they look like the Gaussian
+    before (`shared_among_copies`). The copied Gaussian keeps its moments, scaled as its gradients are
+    (`share_rows_`), and the copies begin with moments of zero. Copies have the level, phi and cull row of the
+    Gaussian that they copy, and no statistics. Draws and ids depend only on (seed, time, id), so the result
+    depends neither on the order of the rows nor on the number of ranks.
+
+    Args:
+        table: changed in place; the rows are those of `placement.place`.
+        rules: thresholds for dead Gaussians, and the limit of the population.
+        growth: share of the population that the event adds.
+        time: time of the event, in images.
+        step: the latest optimiser step; new rows are current up to it.
+        ranks: the job, whose tables together are the population; every rank calls this.
+        extent: extent of the scene, in the unit of the means; only used for the lineage's features.
+        level_count: number of octree levels; only used for the lineage's features.
+        lineage: logs births and deaths, or None.
+        pending: the table's pending steps, of which the copied Gaussians take theirs; None: there are none.
+
+    Returns:
+        The report; `cloned` is the number of all copies on this rank, `relocated` that of the dead they
+        replace.
     """
     opacities = current(table, "opacities", pending)
     causes = death_causes(table, rules, opacities, pending)

@@ -28,22 +28,31 @@ class Composite:
 
 
 def composite(
-    means2d: Tensor,  # [M, 2] px
-    conics: Tensor,  # [M, 3]
-    opacities: Tensor,  # [M]
-    colors: Tensor,  # [M, D]
-    depths: Tensor,  # [M], ascending
-    width: int,  # px
-    height: int,  # px
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    depths: Tensor,
+    width: int,
+    height: int,
     *,
-    # relative distance within which alpha (to 1/255 or 0.99), transmittance (to 1e-4) or the depths of two
-    # consecutive splats of a pixel count as undecided
     tolerance: float = 1e-4,
 ) -> Composite:
     """Composite M splats that are ordered front to back.
 
     alpha = min(0.99, o exp(-q / 2)), q the Mahalanobis distance of the pixel centre; a splat takes part where
     alpha >= 1/255; one that would take the transmittance below 1e-4 is left out and ends the pixel.
+
+    Args:
+        means2d: [M, 2] px.
+        conics: [M, 3].
+        opacities: [M].
+        colors: [M, D].
+        depths: [M], ascending.
+        width: px.
+        height: px.
+        tolerance: relative distance within which alpha (to 1/255 or 0.99), transmittance (to 1e-4) or the
+            depths of two consecutive splats of a pixel count as undecided.
     """
     unclipped, alphas, before, after, weights = _weights(means2d, conics, opacities, width, height)
     values = torch.einsum("mp,md->pd", weights, colors)
@@ -99,22 +108,25 @@ def _cut(unclipped: Tensor, after: Tensor, before: Tensor, depths: Tensor, toler
     return ((undecided | tie) & reached).any(dim=0)
 
 
-def median_splats(
-    weights: Tensor,  # alpha T of M splats, front to back, [M, H, W], zero where a splat is not composited
-) -> Tensor:
-    """Return the last splat composited with a transmittance above 0.5 in front, int64 [H, W]; -1: none."""
+def median_splats(weights: Tensor) -> Tensor:
+    """Return the last splat composited with a transmittance above 0.5 in front of it, int64 [H, W]; -1: none.
+
+    Args:
+        weights: alpha T of M splats, front to back, [M, H, W], zero where a splat is not composited.
+    """
     before = 1 - (weights.cumsum(dim=0) - weights)
     numbers = torch.arange(len(weights))[:, None, None].expand_as(weights)
     return torch.where((weights > 0) & (before > 0.5), numbers, -1).amax(dim=0)
 
 
-def strongest_splats(
-    weights: Tensor,  # as for `median_splats`
-    count: int,  # number of splats of a pixel
-) -> tuple[Tensor, Tensor]:
+def strongest_splats(weights: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Return the splats of the largest weights, front to back, int64 [H, W, count], and their weights.
 
     Of equal weights, the splats in front. Padded with -1 and 0.
+
+    Args:
+        weights: as for `median_splats`.
+        count: number of splats of a pixel.
     """
     weights = torch.cat([weights, weights.new_zeros(count, *weights.shape[1:])])
     largest = weights.argsort(dim=0, descending=True, stable=True)[:count].sort(dim=0).values
@@ -291,15 +303,17 @@ class Scores:
     c_vis: Tensor  # bool [V, N], whether it is within the top 99 % of the view's mass
 
 
-def scores(
-    units: Tensor,  # int64 [V, N], weights in units of 2^-32
-    pixels: Tensor,  # int64 [V, N]
-    visible: Tensor,  # bool [V, N]
-    ids: Tensor,  # int64 [N], which decide between equal weights
-    eps: float,  # added to the pixels in the score
-    phi_eps: float,  # added to c_rad in phi
-) -> Scores:
-    """Aggregate contributions over the views."""
+def scores(units: Tensor, pixels: Tensor, visible: Tensor, ids: Tensor, eps: float, phi_eps: float) -> Scores:
+    """Aggregate contributions over the views.
+
+    Args:
+        units: int64 [V, N], weights in units of 2^-32.
+        pixels: int64 [V, N].
+        visible: bool [V, N].
+        ids: int64 [N], which decide between equal weights.
+        eps: added to the pixels in the score.
+        phi_eps: added to c_rad in phi.
+    """
     c_vis = torch.tensor(
         [top_mass(view, ids.tolist(), Fraction(99, 100)) for view in units.tolist()], dtype=torch.bool
     )

@@ -99,9 +99,7 @@ def api_pages() -> dict[str, str]:
     for room in sorted((ROOT / "blitzgs").iterdir()):
         modules = [file for file in sorted(room.glob("*.py")) if file.stem not in ("__init__", "__main__")]
         if modules:
-            # Shapes stand beside the parameters: the source has them.
-            shown = "    options:\n      show_source: true\n"
-            names = "\n".join(f"::: blitzgs.{room.name}.{file.stem}\n{shown}" for file in modules)
+            names = "\n".join(f"::: blitzgs.{room.name}.{file.stem}\n" for file in modules)
             pages[f"api/{room.name}.md"] = f"# blitzgs.{room.name}\n\n{names}"
     return pages
 
