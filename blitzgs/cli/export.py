@@ -263,19 +263,22 @@ def _export_run(
         if args.clean is not None:
             kept = _cleaned(model, run_folder, args, path, ranks)
         if args.classic and not model.config.model.antialiased:
-            text = "--classic changes nothing: the model was trained without model.antialiased"
-            print(text, file=sys.stderr)
+            print(
+                "--classic changes nothing: the model was trained without model.antialiased", file=sys.stderr
+            )
         elif args.classic:
-            right = "right at the training views' distance, else nearly"
-            print(f"antialiasing is baked into the opacities: {right}")
+            print(
+                "antialiasing is baked into the opacities: right at the training views' distance, else nearly"
+            )
             stored = folder.cameras()
             model = without_antialiasing(model, [stored.cameras[index] for index in stored.train])
         crs, up = None, up_of_run(run_folder, model.space)
         if coordinates == "world":
             frame = load_world_frame(run_folder)
             if frame is None:
-                lacks = "has no geo.json, so its place in the world is unknown"
-                raise FileNotFoundError(f"{run_folder} {lacks}: use blitzgs align")
+                raise FileNotFoundError(
+                    f"{run_folder} has no geo.json, so its place in the world is unknown: use blitzgs align"
+                )
             model, crs, coordinates = in_world(model, frame), frame.crs, "auto"
             up = frame.rotation @ up
     source = Selected(source_of(model, up), selection or Selection(), model.space.offset, kept, score)

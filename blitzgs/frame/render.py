@@ -61,9 +61,16 @@ class RenderOptions:
     def projection(self, views: Views) -> ProjectionOptions:
         """Return the options for projecting into these views."""
         return ProjectionOptions(
-            views.width, views.height, self.tile_size, self.sh_degree, *self.limits,
-            antialiased=self.antialiased, fade=self.fade,
-        )  # fmt: skip
+            width=views.width,
+            height=views.height,
+            tile_size=self.tile_size,
+            sh_degree=self.sh_degree,
+            near_plane=self.near_plane,
+            far_plane=self.far_plane,
+            eps2d=self.eps2d,
+            antialiased=self.antialiased,
+            fade=self.fade,
+        )
 
 
 class Frame(NamedTuple):
@@ -140,9 +147,19 @@ def render_frame(
     saved = RasterizeSaved(columns, backgrounds, lists, [transmittances, last_ids, packed_splats, tile_order])
     others = None if result.way_back is None else result.way_back.cleared_table
     return Frame(
-        views, options, result.projected, splats, assignment, result.way_back, result.visible, rows, renders,
-        tile_work, saved, GradientBuffer(zeros, others),
-    )  # fmt: skip
+        views=views,
+        options=options,
+        projected=result.projected,
+        splats=splats,
+        assignment=assignment,
+        way_back=result.way_back,
+        visible=result.visible,
+        active=rows,
+        renders=renders,
+        tile_work=tile_work,
+        saved=saved,
+        gradients=GradientBuffer(zeros, others),
+    )
 
 
 def _composite(
