@@ -10,14 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 import blitzgs
 from blitzgs._library import LIBRARY_DIR
-from blitzgs.capture.colmap import ColmapCamera, ColmapImages, ColmapModel, ColmapPoints, write_model
-from blitzgs.capture.pictures import save_image
 from blitzgs.formats.ply import read_ply
-from tests.helpers import orbit_camera
+from tests.training.tiny import write_tiny_capture
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENE = (
@@ -71,42 +68,6 @@ def test_gradients_are_computed_from_cpp(build, tmp_path):
     assert (found - means.grad).abs().max() < 1e-5 * means.grad.abs().max()
 
 
-WIDTH, HEIGHT, VIEWS = 64, 48, 12
-
-
-def write_capture(root):
-    """Twelve views of coloured blobs, and a point for every other of them."""
-    generator = torch.Generator().manual_seed(0)
-    means = torch.rand(60, 3, generator=generator) * 2 - 1
-    colors = torch.rand(60, 3, generator=generator)
-    K = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
-    poses = torch.stack([orbit_camera(2 * np.pi * view / VIEWS) for view in range(VIEWS)]).float()
-    images, _, _ = blitzgs.rasterization(
-        means, torch.tensor([[1.0, 0, 0, 0]]).expand(60, 4), torch.full((60, 3), 0.15),
-        torch.full((60,), 0.9), colors, poses, K.expand(VIEWS, 3, 3), WIDTH, HEIGHT,
-    )  # fmt: skip
-    quats = Rotation.from_matrix(poses[:, :3, :3].double().numpy()).as_quat()[:, [3, 0, 1, 2]]
-    names = [f"{view:02}.png" for view in range(VIEWS)]
-    for name, image in zip(names, images, strict=True):
-        save_image(root / "images" / name, image)
-    ids = np.arange(1, VIEWS + 1, dtype="u4")
-    points = ColmapPoints(
-        ids=np.arange(1, 31), positions=means[::2].double().numpy(),
-        colors=(colors[::2] * 255).byte().numpy(), errors=np.zeros(30), track_offsets=np.zeros(31, "u8"),
-    )  # fmt: skip
-    model = ColmapModel(
-        [ColmapCamera(1, "PINHOLE", WIDTH, HEIGHT, np.array([60.0, 60, 32, 24]))],
-        ColmapImages(
-            ids=ids, camera_ids=np.ones(VIEWS, "u4"), quats=quats,
-            translations=poses[:, :3, 3].double().numpy(), names=names,
-            point2d_offsets=np.zeros(VIEWS + 1, "u8"),
-        ),
-        points,
-    )  # fmt: skip
-    (root / "sparse" / "0").mkdir(parents=True)
-    write_model(root / "sparse" / "0", model)
-
-
 def example(name):
     """Import an example."""
     spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
@@ -116,13 +77,13 @@ def example(name):
 
 
 def test_minimal_trainer_it_learns_a_capture(device, tmp_path, capsys):
-    write_capture(tmp_path)
+    write_tiny_capture(tmp_path)
     out = tmp_path / "model.ply"
     torch.manual_seed(0)
-    arguments = ["--data", str(tmp_path), "--out", str(out), "--steps", "700", "--device", device]
+    arguments = ["--data", str(tmp_path), "--out", str(out), "--steps", "420", "--device", device]
     model = example("minimal_trainer").main(arguments)
     printed = capsys.readouterr().out
-    assert float(printed.split(" dB")[0].split()[-1]) > 18
+    assert float(printed.split(" dB")[0].split()[-1]) > 24
     written = read_ply(out)
     assert len(written.means) == len(model.params["means"]) > 20
     assert torch.equal(written.scales, model.params["scales"].detach().cpu())
@@ -131,18 +92,18 @@ def test_minimal_trainer_it_learns_a_capture(device, tmp_path, capsys):
 
 @pytest.mark.parametrize("strategy", ["mcmc", "default"])
 def test_research_trainer_it_learns_a_capture(strategy, tmp_path, capsys):
-    write_capture(tmp_path)
+    write_tiny_capture(tmp_path)
     torch.manual_seed(0)
     out = tmp_path / "model.ply"
     trainer = example("research_trainer").main(
-        ["--data", str(tmp_path), "--out", str(out), "--steps", "210", "--strategy", strategy, "--most", "31",
-         "--device", "cpu"]
+        ["--data", str(tmp_path), "--out", str(out), "--steps", "210", "--strategy", strategy,
+         "--most", "410", "--device", "cpu"]
     )  # fmt: skip
-    assert float(capsys.readouterr().out.split(" dB")[0].split()[-1]) > 15
+    assert float(capsys.readouterr().out.split(" dB")[0].split()[-1]) > 22
     written = read_ply(out)
-    assert len(written.means) == len(trainer.params["means"]) > 25
+    assert len(written.means) == len(trainer.params["means"]) > 350
     if strategy == "mcmc":
-        assert len(written.means) == 31
+        assert len(written.means) == 410
     assert trainer.motions.abs().max() > 0 and trainer.looks.abs().max() > 0.01
 
 
