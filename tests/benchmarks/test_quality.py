@@ -6,7 +6,7 @@ import io
 import json
 import math
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -257,11 +257,14 @@ def test_blocks_are_shared_among_gpus():
     assert makespan([2.0, 3.0, 4.0, 3.0], 2) == 6.0
 
 
-def test_a_partition_is_trained_merged_and_measured_beside_the_whole(trained):
-    flags, out, _ = trained
-    assert bm_quality.main([*flags, "--recipe", f"grid=partition-2x1:defaults {FLAGS}"]) == 0
-    runs = {run["recipe"]: run for run in quality_report.read_runs(out / "runs") if run["ranks"] == 1}
-    grid, whole = runs["grid"], runs["ours"]
+def test_a_partition_is_trained_merged_and_measured_beside_the_whole(trained, capture, tmp_path):
+    spec = spec_of(capture, f"partition-2x1:defaults {FLAGS}")
+    files = [tmp_path / "spec.json", tmp_path / "result.json"]
+    files[0].write_text(json.dumps(asdict(spec)))
+    assert quality_run.main(files) == 0
+    grid = json.loads(files[1].read_text())
+    runs = {run["recipe"]: run for run in quality_report.read_runs(trained[1] / "runs") if run["ranks"] == 1}
+    whole = runs["ours"]
     assert grid["settings"] != whole["settings"] and whole["population"]["final"] == whole["gaussians"]
     assert [block["cell"] for block in grid["blocks"]] == [0, 1]
     assert grid["gaussians"] == sum(block["kept"] for block in grid["blocks"]) > 0
