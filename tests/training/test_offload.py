@@ -33,6 +33,7 @@ COUNT, VIEWS = 4000, 12
 RESIDENT = "memory.resident_gb=0.0039"
 SETTINGS = (
     "lod.visible_threshold=0", "schedule.iterations=60", "population.max_gaussians=20000",
+    "population.grad_threshold=2e-4",
 )  # fmt: skip
 TOUR = (RESIDENT, "memory.tour=true")
 

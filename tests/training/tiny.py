@@ -36,7 +36,7 @@ WIDTH, HEIGHT, COUNT = 48, 32, 400
 OVERRIDES = (
     "population.pixels_per_gaussian=0", "schedule.iterations=100", "schedule.densify_from=20",
     "schedule.densify_until=90", "schedule.densify_every=20", "schedule.size_prune_after=50",
-    "schedule.sh_every=30", "population.grad_threshold=2e-4", "population.prune_screen_radius=0",
+    "schedule.sh_every=30", "population.grad_threshold=2e-3", "population.prune_screen_radius=0",
     "log.every=20", "log.tensorboard=false",
 )  # fmt: skip
 
