@@ -255,6 +255,17 @@ def test_final_rules_replace_many_pending_steps(gap, dtype):
         torch.testing.assert_close(state.params, alone.params, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("steps", [1, 60, 100_000])
+def test_a_schedule_makes_its_tables_once(steps, dtype):
+    schedule = schedule_of(steps, dtype)
+    reach = explicit_steps(BETA1, BETA2, dtype)
+    assert [len(table) for table in schedule.tables] == [steps + 1, steps + 1, max(0, steps + 1 - reach)]
+    assert schedule.tables[0] is schedule.table and schedule.tables[1] is schedule.lr_table
+    assert schedule.tables[2].shape[1] == 28 * dtype.itemsize
+    assert schedule.constants(7) == (7, reach, BETA1, BETA2, EPS)
+
+
 def test_a_schedule_of_another_dtype_is_refused():
     state, _ = one_update(dtype=torch.float64)
     schedule = schedule_of(4000, torch.float32)
