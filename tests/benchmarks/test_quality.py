@@ -154,7 +154,7 @@ def test_several_ranks_train_one_run_to_the_same_model(trained):
     runs = [run for run in quality_report.read_runs(out / "runs") if run["recipe"] == "ours"]
     one, two = sorted(runs, key=lambda run: len(run["name"]))
     assert two["name"] == one["name"] + ".r2" and (one["ranks"], two["ranks"]) == (1, 2)
-    assert two["gaussians"] == pytest.approx(one["gaussians"], rel=1e-3)  # rounding may decide on one
+    assert two["gaussians"] == pytest.approx(one["gaussians"], abs=3)  # rounding may decide on some
     assert len(two["population"]["peak_memory_bytes"]) == 2
     assert two["population"]["peak_memory_bytes"][0] == two["peak_memory_bytes"]  # without evaluations
     psnr = [run["evaluations"][-1]["test"]["psnr"] for run in (one, two)]

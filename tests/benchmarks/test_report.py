@@ -36,6 +36,7 @@ def measure_with(monkeypatch, tmp_path, command):
     gpus = {"exchange": 0, "quality": 0, "step_1": 4}
     monkeypatch.setattr(measure, "PLAN", tuple(measure.Job(*job) for job in gpus.items()))
     monkeypatch.setenv("BLITZGS_COMMIT", "abc")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
     folders = ["--work", str(tmp_path / "work"), "--results", str(tmp_path / "results")]
     return measure.main([*folders, "--gpus", "0", "--only", "exchange", "quality", "step_1"])
 
@@ -49,14 +50,14 @@ def test_one_command_measures_what_it_can_and_continues(tmp_path, monkeypatch, c
         and "step_1: not measured, needs 4 GPUs" in printed
     )
     assert "bm_nothing.py" in (tmp_path / "work" / "exchange.log").read_text()
-    flags = "--gaussians 2000 --ranks 2 --batch 1 --batches 1 --visits 1 --device cpu"
+    flags = "--gaussians 2000 --ranks 1 2 --batch 1 --batches 1 --visits 1 --device cpu"
     good = f"python benchmarks/bm_exchange.py {flags}"
     measure_with(monkeypatch, tmp_path, good)
     assert "exchange: done" in capsys.readouterr().out
     # What the benchmark writes is what the report reads.
     page = made(tmp_path / "results", "exchange")
     assert f"`{good}`" in page and "commit abc" in page
-    for line in ("| project | ", "| optimiser | ", "| **steps in a row** | ", "| MB between ranks | 0 |"):
+    for line in ("| project | ", "| optimiser | ", "| **steps in a row** | ", "| MB between ranks | 0 | "):
         assert f"\n{line}" in page
     measure_with(monkeypatch, tmp_path, good)
     assert "exchange" not in capsys.readouterr().out
