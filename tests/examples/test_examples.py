@@ -13,8 +13,9 @@ import torch
 
 import blitzgs
 from blitzgs._library import LIBRARY_DIR
+from blitzgs.capture.pictures import save_image
 from blitzgs.formats.ply import read_ply
-from tests.training.tiny import write_tiny_capture
+from tests.helpers import orbit_camera, write_colmap
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENE = (
@@ -68,6 +69,28 @@ def test_gradients_are_computed_from_cpp(build, tmp_path):
     assert (found - means.grad).abs().max() < 1e-5 * means.grad.abs().max()
 
 
+WIDTH, HEIGHT, VIEWS = 64, 48, 12
+
+
+def write_capture(root):
+    """Twelve views of coloured blobs, and a point for every other of them."""
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand(60, 3, generator=generator) * 2 - 1
+    colors = torch.rand(60, 3, generator=generator)
+    K = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+    poses = torch.stack([orbit_camera(2 * np.pi * view / VIEWS) for view in range(VIEWS)]).float()
+    images, _, _ = blitzgs.rasterization(
+        means, torch.tensor([[1.0, 0, 0, 0]]).expand(60, 4), torch.full((60, 3), 0.15),
+        torch.full((60,), 0.9), colors, poses, K.expand(VIEWS, 3, 3), WIDTH, HEIGHT,
+    )  # fmt: skip
+    names = [f"{view:02}.png" for view in range(VIEWS)]
+    for name, image in zip(names, images, strict=True):
+        save_image(root / "images" / name, image)
+    points = means[::2].double().numpy(), (colors[::2] * 255).byte().numpy()
+    camera = (WIDTH, HEIGHT, 60.0, 60.0, 32.0, 24.0)
+    write_colmap(root / "sparse/0", camera, names, poses.double().numpy(), *points)
+
+
 def example(name):
     """Import an example."""
     spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
@@ -77,13 +100,13 @@ def example(name):
 
 
 def test_minimal_trainer_it_learns_a_capture(device, tmp_path, capsys):
-    write_tiny_capture(tmp_path)
+    write_capture(tmp_path)
     out = tmp_path / "model.ply"
     torch.manual_seed(0)
-    arguments = ["--data", str(tmp_path), "--out", str(out), "--steps", "420", "--device", device]
+    arguments = ["--data", str(tmp_path), "--out", str(out), "--steps", "700", "--device", device]
     model = example("minimal_trainer").main(arguments)
     printed = capsys.readouterr().out
-    assert float(printed.split(" dB")[0].split()[-1]) > 24
+    assert float(printed.split(" dB")[0].split()[-1]) > 18
     written = read_ply(out)
     assert len(written.means) == len(model.params["means"]) > 20
     assert torch.equal(written.scales, model.params["scales"].detach().cpu())
@@ -92,18 +115,18 @@ def test_minimal_trainer_it_learns_a_capture(device, tmp_path, capsys):
 
 @pytest.mark.parametrize("strategy", ["mcmc", "default"])
 def test_research_trainer_it_learns_a_capture(strategy, tmp_path, capsys):
-    write_tiny_capture(tmp_path)
+    write_capture(tmp_path)
     torch.manual_seed(0)
     out = tmp_path / "model.ply"
     trainer = example("research_trainer").main(
-        ["--data", str(tmp_path), "--out", str(out), "--steps", "210", "--strategy", strategy,
-         "--most", "410", "--device", "cpu"]
+        ["--data", str(tmp_path), "--out", str(out), "--steps", "210", "--strategy", strategy, "--most", "31",
+         "--device", "cpu"]
     )  # fmt: skip
-    assert float(capsys.readouterr().out.split(" dB")[0].split()[-1]) > 22
+    assert float(capsys.readouterr().out.split(" dB")[0].split()[-1]) > 15
     written = read_ply(out)
-    assert len(written.means) == len(trainer.params["means"]) > 350
+    assert len(written.means) == len(trainer.params["means"]) > 25
     if strategy == "mcmc":
-        assert len(written.means) == 410
+        assert len(written.means) == 31
     assert trainer.motions.abs().max() > 0 and trainer.looks.abs().max() > 0.01
 
 
