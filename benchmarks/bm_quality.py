@@ -87,14 +87,7 @@ class Pool:
         spec_path.write_text(json.dumps(dataclasses.asdict(spec)))
         log = (self.out / "logs" / f"{spec.name}.txt").open("w")
         worker = Path(__file__).with_name(self.worker)
-        root = str(worker.parents[1])
-        cores = max(1, (os.cpu_count() or 1) // (max(self.gpus, 1) * self.per_gpu))
-        environment = os.environ | {
-            "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")])),
-            "PYTHONUNBUFFERED": "1",
-            "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", str(cores)),
-            "BLITZGS_COMMIT": harness.commit(),
-        }
+        environment = harness.child_environment(max(self.gpus, 1) * self.per_gpu)
         if self.gpus:
             visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
             visible = visible or [str(gpu) for gpu in range(self.gpus)]
@@ -224,11 +217,7 @@ def make_parser() -> argparse.ArgumentParser:
         help="measure held-out views after so many images, and at the end (%(default)s)",
     )
     parser.add_argument(
-        "--ranks",
-        type=harness.positive,
-        default=1,
-        metavar="N",
-        help="GPUs that train a run (%(default)s)",
+        "--ranks", type=harness.positive, default=1, metavar="N", help="GPUs that train a run (%(default)s)"
     )
     parser.add_argument(
         "--collect", type=Path, nargs="*", metavar="SOURCE",

@@ -16,7 +16,6 @@ import sys
 import tempfile
 import threading
 import time
-import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +25,7 @@ import bm_popping
 import torch
 from harness import environment, synchronize
 from quality_plan import RunSpec
-from quality_run import describe, means_of, write
+from quality_run import describe, means_of, work, write
 
 from blitzgs.config.fields import Config
 from blitzgs.distributed.group import Ranks
@@ -126,8 +125,10 @@ def _mean_share(records: Sequence[Record], name: str) -> float | None:
     return statistics.fmean(r[name] / r["gaussians"] for r in records) if records else None
 
 
-def train(spec: CityRun, result: Record, path: Path, folder: Path, since: float) -> None:
+def train(spec: CityRun, result: Record, path: Path, folder: Path, since: float) -> Record:
     """Train, evaluate and, if planned, measure popping; add to the result, and write it after each part.
+
+    Returns its last "status".
 
     `path`: of the result's file, which rank 0 writes. `folder`: for the run's log. `since`: when the process
     began, by `time.monotonic`.
@@ -189,7 +190,7 @@ def train(spec: CityRun, result: Record, path: Path, folder: Path, since: float)
             model = TrainedModel(state.config, state.progress, state.space, state.table)
             result["popping"] = bm_popping.popping_of(model, capture.cameras, ranks, frames=spec.popping)
             note("popped")
-    result["status"] = "done" if is_done else "stopped"
+    return {"status": "done" if is_done else "stopped"}
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -203,14 +204,7 @@ def main(arguments: Sequence[str]) -> int:
     watchdog.start()
     result = describe(spec) | {"status": "running", "finished": False}
     with tempfile.TemporaryDirectory() as folder:
-        try:
-            train(spec, result, result_path, Path(folder), since)
-        except Exception as error:
-            traceback.print_exc()
-            result |= {"status": "failed", "error": f"{type(error).__name__}: {error}"}
-    if os.environ.get("RANK", "0") == "0":
-        write(result_path, result)
-    return 0 if result["status"] in ("done", "stopped") else 1
+        return work(result, result_path, lambda: train(spec, result, result_path, Path(folder), since))
 
 
 if __name__ == "__main__":

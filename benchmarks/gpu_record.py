@@ -305,9 +305,7 @@ def main(arguments: list[str] | None = None) -> int:
     if (commit := harness.commit()) == "unknown":
         parser.error("the commit of these sources is unknown: name it with --commit")
     # Tests and benchmarks start further processes, which have to find the package.
-    os.environ["PYTHONPATH"] = os.pathsep.join(
-        filter(None, (str(harness.ROOT), os.environ.get("PYTHONPATH")))
-    )
+    os.environ["PYTHONPATH"] = harness.child_environment(1)["PYTHONPATH"]
     about = {
         "command": "python benchmarks/gpu_record.py",
         "commit": commit,

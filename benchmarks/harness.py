@@ -183,6 +183,18 @@ def seconds_of(device: torch.device | str, call: Callable[[], object]) -> float:
     return time.perf_counter() - begin
 
 
+def child_environment(side_by_side: int) -> dict[str, str]:
+    """Return the environment of programs that run side by side: package, commit, and share of the cores."""
+    paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {
+        "OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // side_by_side)),
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(paths),
+        "PYTHONUNBUFFERED": "1",
+        "BLITZGS_COMMIT": commit(),
+    }
+
+
 def torchrun(ranks: int) -> list[str]:
     """Return the arguments of Python that run the script which follows them on so many ranks of this host."""
     return ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"]

@@ -14,7 +14,6 @@ and so are commands that need more GPUs than there are. The GPU tests are not pa
 from __future__ import annotations
 
 import json
-import os
 import re
 import shlex
 import shutil
@@ -87,13 +86,7 @@ def run_all(jobs: list[Job], gpus: int, work: Path, captures: dict[str, str], re
     """Run jobs side by side; returns the exit status."""
     begin, free, status = time.monotonic(), list(range(gpus)), 0
     running: list[tuple[Job, list[int], subprocess.Popen[bytes], float]] = []
-    paths = [str(harness.ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = os.environ | {
-        "BLITZGS_COMMIT": harness.commit(),
-        "OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // max(gpus, 1))),
-        "PYTHONPATH": os.pathsep.join(paths),
-        "PYTHONUNBUFFERED": "1",
-    }
+    environment = harness.child_environment(max(gpus, 1))
     while jobs or running:
         while jobs and jobs[0].gpus <= len(free):
             job = jobs.pop(0)

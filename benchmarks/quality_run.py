@@ -246,24 +246,32 @@ def write(path: Path, result: dict[str, Any]) -> None:
     partial.replace(path)
 
 
+def work(result: dict[str, Any], path: Path, train: Callable[[], dict[str, Any]]) -> int:
+    """Add to a result what a training returns, or its error; rank 0 writes it. Returns the exit status."""
+    try:
+        result |= {"status": "done"} | train()
+    except Exception as error:
+        traceback.print_exc()
+        result |= {"status": "failed", "error": f"{type(error).__name__}: {error}"}
+    if os.environ.get("RANK", "0") == "0":
+        write(path, result)
+    return 0 if result["status"] in ("done", "stopped") else 1
+
+
 def main(arguments: Sequence[str]) -> int:
     """Do one run; returns the exit status."""
     spec_path, result_path = map(Path, arguments)
     spec = RunSpec(**json.loads(spec_path.read_text()))
-    result = describe(spec)
     begin = time.monotonic()
-    try:
+
+    def run() -> dict[str, Any]:
         train = train_ours if spec.strategy is None else train_opponent
         with Ranks.from_environment(spec.device) as ranks:
             found = (train if spec.grid is None else train_partition)(spec, ranks)
-        result |= {"status": "done", "environment": environment(spec.device)} | found
-    except Exception as error:
-        traceback.print_exc()
-        result |= {"status": "failed", "error": f"{type(error).__name__}: {error}"}
-    result["wall_seconds"] = time.monotonic() - begin
-    if os.environ.get("RANK", "0") == "0":
-        write(result_path, result)
-    return 0 if result["status"] == "done" else 1
+        seconds = time.monotonic() - begin
+        return {"environment": environment(spec.device), "wall_seconds": seconds} | found
+
+    return work(describe(spec), result_path, run)
 
 
 if __name__ == "__main__":

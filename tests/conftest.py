@@ -17,7 +17,7 @@ _TRAININGS = ("config", "report", "runs", "spawn", "training")
 
 # Of `lineage_run`: density events at 20, 40, 60 and 80; the gate judges from 60 on, a checkpoint lies at 50.
 LINEAGE = (
-    "population.lineage=true", "population.grad_threshold=1e-4", "population.importance=true",
+    "population.lineage=true", "population.grad_threshold=1e-3", "population.importance=true",
     "schedule.t1=40", "schedule.t2=90", "schedule.gate_from=60", "schedule.checkpoint_every=50",
     "log.keep_checkpoints=9",
 )  # fmt: skip
@@ -84,8 +84,8 @@ def capture(tmp_path_factory):
 def trained(capture, tmp_path_factory):
     """A capture and a short run of it, made by the command line."""
     data, folder = capture, tmp_path_factory.mktemp("runs") / "run"
-    flags = as_flags("config=defaults", *OVERRIDES)
-    assert main(["train", "--data", str(data), "--out", str(folder), "--schedule.scale=0.4", *flags]) == 0
+    flags = as_flags("config=defaults", *OVERRIDES, "population.grad_threshold=2e-4", "schedule.scale=0.4")
+    assert main(["train", "--data", str(data), "--out", str(folder), *flags]) == 0
     return data, folder
 
 

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 import blitzgs
+from blitzgs.capture import colmap
 from blitzgs.formats.gaussians import Gaussians
 from blitzgs.formats.models import FORMATS
 from blitzgs.frame.render import Frame, backward_splats
@@ -28,6 +29,7 @@ from blitzgs.runs.export import Exported, export
 from blitzgs.runs.folder import Model
 from blitzgs.runs.source import source_of
 from blitzgs.table.table import GaussianTable
+from blitzgs.util.rotations import quaternions
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors", "viewmats")
 
@@ -147,6 +149,31 @@ def look_at_origin(position) -> np.ndarray:
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
     pose[:3, 3] = -pose[:3, :3] @ position
     return pose
+
+
+def write_colmap(folder: Path, camera: tuple, names: list, poses: np.ndarray, points, colors) -> None:
+    """Write a COLMAP model without observations.
+
+    `camera`: width, height, fx, fy, cx, cy of a pinhole camera. `poses`: world-to-camera [N, 4, 4].
+    """
+    count, (width, height, *params) = len(names), camera
+    images = colmap.ColmapImages(
+        ids=np.arange(1, count + 1, dtype=np.uint32),
+        camera_ids=np.ones(count, dtype=np.uint32),
+        quats=quaternions(torch.from_numpy(poses[:, :3, :3])).numpy(),
+        translations=poses[:, :3, 3],
+        names=names,
+        point2d_offsets=np.zeros(count + 1, dtype=np.uint64),
+    )
+    cloud = colmap.ColmapPoints(
+        ids=np.arange(1, len(points) + 1, dtype=np.int64),
+        positions=points,
+        colors=colors,
+        errors=np.ones(len(points)),
+        track_offsets=np.zeros(len(points) + 1, dtype=np.uint64),
+    )
+    cameras = [colmap.ColmapCamera(1, "PINHOLE", width, height, np.array(params))]
+    colmap.write_model(folder, colmap.ColmapModel(cameras, images, cloud))
 
 
 def reference_images(scene: Scene, backgrounds: Tensor | None = None, **options) -> list[ReferenceImage]:

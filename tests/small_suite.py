@@ -74,7 +74,7 @@ TESTS = [
         "render.py::test_a_list_of_pixels_has_their_rows_in_its_order[cuda]",
         "render.py::test_nothing_to_composite[cuda]",
         "sums.py::test_density_stats_match_the_definition[cuda-True]",
-        "positions.py::test_position_noise_matches_the_formula[cuda]",
+        "positions.py::test_position_noise_matches_the_formula[cuda-float32]",
         "positions.py::test_scales_are_limited_by_the_distance_from_the_middle[cuda]",
         "positions.py::test_knn_distances_match_a_kd_tree[cuda-uniform-3]",
         "positions.py::test_knn_distances_of_small_clouds[cuda]",

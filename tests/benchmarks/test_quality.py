@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The quality benchmark: its runs, its tables, its stress grid, and the opponents it trains."""
 
+import contextlib
+import io
 import json
 import math
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -31,13 +33,20 @@ def spec_of(capture, source, device="cpu", **changes) -> RunSpec:
     return replace(spec, **changes)
 
 
-def test_runs_are_done_once_and_a_failure_stops_no_other(tmp_path, capture, capsys):
-    out, missing = tmp_path / "out", tmp_path / "missing.txt"
-    flags = ["--out", str(out), "--gpus", "0", "--per-gpu", "2", "--evaluate-at", "40"]
+@pytest.fixture(scope="module")
+def trained(capture, tmp_path_factory):
+    """Flags of a finished run, its folder, which also has a broken one, and what was printed."""
+    out = tmp_path_factory.mktemp("quality") / "out"
+    flags = ["--out", str(out), "--gpus", "0", "--per-gpu", "2", "--evaluate-at", "40", "--seeds", "3"]
     flags += ["--capture", f"tiny={capture}", "--recipe", f"ours=defaults {FLAGS}"]
-    broken = ["--recipe", f"broken=defaults --data.split={missing}", "--seeds", "3"]
-    assert bm_quality.main([*flags, *broken]) == 1
-    printed = capsys.readouterr().out
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        missing = out.parent / "missing.txt"
+        assert bm_quality.main([*flags, "--recipe", f"broken=defaults --data.split={missing}"]) == 1
+    return flags, out, printed.getvalue()
+
+
+def test_runs_are_done_once_and_a_failure_stops_no_other(trained, tmp_path, capsys):
+    flags, out, printed = trained
     assert "missing.txt" in printed and "| ours | 100 | 1 |" in printed
     done, broken = sorted(quality_report.read_runs(out / "runs"), key=lambda run: run["status"])
     assert done["status"] == "done" and [e["images"] for e in done["evaluations"]] == [40, 100]
@@ -52,7 +61,7 @@ def test_runs_are_done_once_and_a_failure_stops_no_other(tmp_path, capture, caps
 
     # A second call repeats no finished run. A budget of no time starts no run.
     written = {path: path.stat().st_mtime_ns for path in (out / "runs").glob("tiny.ours*")}
-    assert bm_quality.main([*flags, "--seeds", "3", "--only", "^ours$"]) == 0
+    assert bm_quality.main([*flags, "--only", "^ours$"]) == 0
     assert bm_quality.main([*flags, "--seeds", "3", "4", "--minutes", "0"]) == 0
     assert "1 runs left" in capsys.readouterr().out
     assert written == {path: path.stat().st_mtime_ns for path in (out / "runs").glob("tiny.ours*")}
@@ -99,14 +108,14 @@ def test_settings_tell_recipes_apart_but_not_seeds_or_places(capture):
 @pytest.mark.parametrize("strategy", ["default", "default-reset", "mcmc"])
 def test_gsplats_strategies_train(capture, strategy, device):
     pytest.importorskip("gsplat")
-    # Times of 30,000 steps in 240: density from 4 on, every step; resets, where there are any, each 24.
-    source = f"gsplat-{strategy} --steps_scaler=0.008 "
+    # Times of 30,000 steps in 120: density from 2 on, every step; resets, where there are any, each 12.
+    source = f"gsplat-{strategy} --steps_scaler=0.004 "
     source += "--cap_max=450" if strategy == "mcmc" else "--grow_grad2d=0.002"
     result = quality_run.train_opponent(spec_of(capture, source, device), Ranks(device=torch.device(device)))
     # Training views are measured after 7,000 and 15,000 of 30,000 steps and at the end.
-    assert [e["images"] for e in result["evaluations"]] == [40, 56, 120, 240]
+    assert [e["images"] for e in result["evaluations"]] == [28, 40, 60, 120]
     quoted = [e["images"] for e in result["evaluations"] if "train" in e]
-    assert quoted == [56, 120, 240] and result["images"] == 240
+    assert quoted == [28, 60, 120] and result["images"] == 120
     start, end = result["evaluations"][0]["test"], result["evaluations"][-1]
     assert end["train"]["psnr"] > start["psnr"] and end["train"]["psnr"] > 18
     assert result["peak_gaussians"] >= result["gaussians"] != 400
@@ -118,12 +127,12 @@ def test_gsplats_strategies_train(capture, strategy, device):
 def test_resets_are_where_gsplat_announces_them(reset):
     pytest.importorskip("gsplat")
     scene, images = tiny_scene()
-    options = GsplatOptions.of("default", {"steps_scaler": 0.008, "reset": reset})
+    options = GsplatOptions.of("default", {"steps_scaler": 0.004, "reset": reset})
     trainer = GsplatTrainer("default", options, scene, images, torch.device("cpu"), seed=0)
-    trainer.train_to(24)
+    trainer.train_to(12)
     highest = trainer.params["opacities"].sigmoid().max().item()
     assert highest > 0.1
-    trainer.train_to(25)
+    trainer.train_to(13)
     after = trainer.params["opacities"].sigmoid().max().item()
     assert (after == pytest.approx(0.01, rel=1e-4)) == reset
 
@@ -139,13 +148,13 @@ def test_the_scene_is_in_gsplats_unit():
     assert space.extent == pytest.approx(1.1 * 3 / math.hypot(3, 2.5))
 
 
-def test_several_ranks_train_one_run_to_the_same_model(tmp_path, capture):
-    flags = ["--out", str(tmp_path), "--gpus", "0", "--evaluate-at", "40", "--seeds", "3"]
-    flags += ["--capture", f"tiny={capture}", "--recipe", f"ours=defaults {FLAGS}"]
-    assert bm_quality.main(flags) == bm_quality.main([*flags, "--ranks", "2"]) == 0
-    one, two = sorted(quality_report.read_runs(tmp_path / "runs"), key=lambda run: len(run["name"]))
+def test_several_ranks_train_one_run_to_the_same_model(trained):
+    flags, out, _ = trained
+    assert bm_quality.main([*flags, "--per-gpu", "1", "--ranks", "2"]) == 0
+    runs = [run for run in quality_report.read_runs(out / "runs") if run["recipe"] == "ours"]
+    one, two = sorted(runs, key=lambda run: len(run["name"]))
     assert two["name"] == one["name"] + ".r2" and (one["ranks"], two["ranks"]) == (1, 2)
-    assert two["gaussians"] == pytest.approx(one["gaussians"], rel=1e-3)  # rounding may decide on one
+    assert two["gaussians"] == pytest.approx(one["gaussians"], abs=3)  # rounding may decide on some
     assert len(two["population"]["peak_memory_bytes"]) == 2
     assert two["population"]["peak_memory_bytes"][0] == two["peak_memory_bytes"]  # without evaluations
     psnr = [run["evaluations"][-1]["test"]["psnr"] for run in (one, two)]
@@ -248,13 +257,14 @@ def test_blocks_are_shared_among_gpus():
     assert makespan([2.0, 3.0, 4.0, 3.0], 2) == 6.0
 
 
-def test_a_partition_is_trained_merged_and_measured_beside_the_whole(tmp_path, capture):
-    out = tmp_path / "out"
-    flags = ["--out", str(out), "--gpus", "0", "--capture", f"tiny={capture}"]
-    flags += ["--recipe", f"whole=defaults {FLAGS}", "--recipe", f"grid=partition-2x1:defaults {FLAGS}"]
-    assert bm_quality.main(flags) == 0
-    runs = {run["recipe"]: run for run in quality_report.read_runs(out / "runs")}
-    grid, whole = runs["grid"], runs["whole"]
+def test_a_partition_is_trained_merged_and_measured_beside_the_whole(trained, capture, tmp_path):
+    spec = spec_of(capture, f"partition-2x1:defaults {FLAGS}")
+    files = [tmp_path / "spec.json", tmp_path / "result.json"]
+    files[0].write_text(json.dumps(asdict(spec)))
+    assert quality_run.main(files) == 0
+    grid = json.loads(files[1].read_text())
+    runs = {run["recipe"]: run for run in quality_report.read_runs(trained[1] / "runs") if run["ranks"] == 1}
+    whole = runs["ours"]
     assert grid["settings"] != whole["settings"] and whole["population"]["final"] == whole["gaussians"]
     assert [block["cell"] for block in grid["blocks"]] == [0, 1]
     assert grid["gaussians"] == sum(block["kept"] for block in grid["blocks"]) > 0
@@ -263,5 +273,5 @@ def test_a_partition_is_trained_merged_and_measured_beside_the_whole(tmp_path, c
     assert grid["images"] == sum(block["images"] for block in grid["blocks"])
     assert grid["seconds"] >= sum(block["seconds"] for block in grid["blocks"])
     # Each half was trained as long as the whole: the merged model shows the scene.
-    psnr = {name: run["evaluations"][-1]["test"]["psnr"] for name, run in runs.items()}
-    assert psnr["grid"] > psnr["whole"] - 6 > 10
+    psnr = [run["evaluations"][-1]["test"]["psnr"] for run in (grid, whole)]
+    assert psnr[0] > psnr[1] - 6 > 10

@@ -7,15 +7,13 @@ import warnings
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
-from blitzgs.capture import colmap
 from blitzgs.capture.cameras import rectify
 from blitzgs.capture.capture import load_capture
 from blitzgs.capture.lengths import NEAR_OF_EXTENT
 from blitzgs.capture.lens import Lens
 from tests.capture.helpers import as_text, at, frame, smooth_image, write_image, write_ply, write_transforms
-from tests.helpers import look_at_origin, refused
+from tests.helpers import look_at_origin, refused, write_colmap
 
 COUNT, W, H = 12, 64, 48
 NAMES = [f"{i:02d}.png" for i in range(COUNT)]
@@ -44,25 +42,8 @@ def write(root, form, rotations, centres, points):
             frames.append(frame(f"images/{name}", pose))
         write_transforms(root, frames, fl_x=50.0, w=W, h=H, ply_file_path="p.ply")
         return
-    model = colmap.ColmapModel(
-        [colmap.ColmapCamera(1, "PINHOLE", W, H, np.array([50.0, 50.0, W / 2, H / 2]))],
-        colmap.ColmapImages(
-            ids=np.arange(1, COUNT + 1, dtype=np.uint32),
-            camera_ids=np.ones(COUNT, dtype=np.uint32),
-            quats=Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]],
-            translations=-np.einsum("nij,nj->ni", rotations, centres),
-            names=NAMES,
-            point2d_offsets=np.zeros(COUNT + 1, dtype=np.uint64),
-        ),
-        colmap.ColmapPoints(
-            ids=np.arange(1, len(points) + 1, dtype=np.int64),
-            positions=points,
-            colors=colors,
-            errors=np.zeros(len(points)),
-            track_offsets=np.zeros(len(points) + 1, dtype=np.uint64),
-        ),
-    )
-    colmap.write_model(root / "sparse" / "0", model)
+    poses = np.concatenate([rotations, -rotations @ centres[..., None]], axis=2)
+    write_colmap(root / "sparse/0", (W, H, 50.0, 50.0, W / 2, H / 2), NAMES, poses, points, colors)
     if form == "text":
         as_text(root / "sparse" / "0")
 

@@ -78,25 +78,6 @@ def test_empty_and_invalid():
     refused(ValueError, r"fraction must be in \[0, 1\], got 2", mass_prefix, torch.ones(3), ids, 2, ALONE)
 
 
-def test_sampling_is_proportional_and_skips_zero():
-    n, k = 400, 100
-    weights = torch.ones(n)
-    weights[:40] = 5.0
-    weights[-40:] = 0.0
-    ids = torch.arange(n)
-    hits = torch.zeros(n)
-    for event in range(200):
-        hits += smallest(sampling_keys(weights, ids, 3, event), ids, k, ALONE)
-    assert hits[-40:].sum() == 0
-    heavy, light = hits[:40].mean() / 200, hits[40:-40].mean() / 200
-    # Without replacement: 1 - exp(-w t) with 40 (1 - exp(-5 t)) + 320 (1 - exp(-t)) = 100, t = 0.2523.
-    assert abs(heavy - 0.717) < 0.03
-    assert abs(light - 0.223) < 0.01
-    everything = smallest(sampling_keys(weights, ids, 3, 0), ids, n - 20, ALONE)
-    assert everything[:-40].all()
-    assert everything[-40:].sum() == 20
-
-
 def _select(ranks):
     ids, columns = cases()
     mine = (torch.arange(len(ids)) * 7 // 5) % ranks.world_size == ranks.rank

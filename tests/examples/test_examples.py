@@ -10,14 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 import blitzgs
 from blitzgs._library import LIBRARY_DIR
-from blitzgs.capture.colmap import ColmapCamera, ColmapImages, ColmapModel, ColmapPoints, write_model
 from blitzgs.capture.pictures import save_image
 from blitzgs.formats.ply import read_ply
-from tests.helpers import orbit_camera
+from tests.helpers import orbit_camera, write_colmap
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENE = (
@@ -85,26 +83,12 @@ def write_capture(root):
         means, torch.tensor([[1.0, 0, 0, 0]]).expand(60, 4), torch.full((60, 3), 0.15),
         torch.full((60,), 0.9), colors, poses, K.expand(VIEWS, 3, 3), WIDTH, HEIGHT,
     )  # fmt: skip
-    quats = Rotation.from_matrix(poses[:, :3, :3].double().numpy()).as_quat()[:, [3, 0, 1, 2]]
     names = [f"{view:02}.png" for view in range(VIEWS)]
     for name, image in zip(names, images, strict=True):
         save_image(root / "images" / name, image)
-    ids = np.arange(1, VIEWS + 1, dtype="u4")
-    points = ColmapPoints(
-        ids=np.arange(1, 31), positions=means[::2].double().numpy(),
-        colors=(colors[::2] * 255).byte().numpy(), errors=np.zeros(30), track_offsets=np.zeros(31, "u8"),
-    )  # fmt: skip
-    model = ColmapModel(
-        [ColmapCamera(1, "PINHOLE", WIDTH, HEIGHT, np.array([60.0, 60, 32, 24]))],
-        ColmapImages(
-            ids=ids, camera_ids=np.ones(VIEWS, "u4"), quats=quats,
-            translations=poses[:, :3, 3].double().numpy(), names=names,
-            point2d_offsets=np.zeros(VIEWS + 1, "u8"),
-        ),
-        points,
-    )  # fmt: skip
-    (root / "sparse" / "0").mkdir(parents=True)
-    write_model(root / "sparse" / "0", model)
+    points = means[::2].double().numpy(), (colors[::2] * 255).byte().numpy()
+    camera = (WIDTH, HEIGHT, 60.0, 60.0, 32.0, 24.0)
+    write_colmap(root / "sparse/0", camera, names, poses.double().numpy(), *points)
 
 
 def example(name):

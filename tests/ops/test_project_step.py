@@ -166,10 +166,20 @@ def test_float64_and_nothing_visible():
 
 
 def test_errors_name_the_value():
-    scene = Scene(20, 16, 1)
-    scene.v.parts[1] = scene.v.parts[1][:, :2]
+    scene = Scene(20, 16, 2)
+    whole, weights = scene.v, scene.opacity_reg
+    scene.opacity_reg = weights.double()
+    refused(RuntimeError, "project_bwd: opacity_reg must be Float, got Double", scene.backward)
+    scene.opacity_reg = weights[:1]
+    refused(RuntimeError, r"project_bwd_step_: opacity_reg must have shape \[2\], got \[1\]", scene.at_once)
+    scene.opacity_reg = weights
+    scene.v = SplatGradients([torch.zeros(len(whole.parts[0]), 12)])
+    refused(RuntimeError, "project_bwd_step_: a table of gradients needs CUDA", scene.at_once)
+    scene.v = SplatGradients([whole.parts[0], whole.parts[3]])
+    refused(RuntimeError, "v_splats must be v_means2d, .* or one table, got 2 tensors", scene.backward)
+    scene.v = SplatGradients([whole.parts[0], whole.parts[1][:, :2], *whole.parts[2:]])
     refused(RuntimeError, r"project_bwd_step_: v_conics must have shape \[\d+, 3\]", scene.at_once)
-    scene.render()
+    scene.v = whole
     scene.state.exp_avgs[4] = scene.state.exp_avgs[4][:, :4].contiguous()
     refused(RuntimeError, r"the moments of sh must have its shape \[20, 16, 3\]", scene.at_once)
 
@@ -191,24 +201,6 @@ def test_regularisers_have_the_gradients_of_their_definitions(backend):
         torch.testing.assert_close(
             got.double(), want, rtol=1e-5 * scale, atol=1e-6 * scale * float(want.abs().max())
         )
-
-
-def test_errors_name_what_is_wrong_with_weights():
-    scene = Scene(20, 16, 2)
-    weights = scene.opacity_reg
-    scene.opacity_reg = weights.double()
-    refused(RuntimeError, "project_bwd: opacity_reg must be Float, got Double", scene.backward)
-    scene.opacity_reg = weights[:1]
-    refused(RuntimeError, r"project_bwd_step_: opacity_reg must have shape \[2\], got \[1\]", scene.at_once)
-
-
-def test_errors_name_what_is_wrong_with_tables():
-    scene = Scene(20, 16, 1)
-    whole = scene.v
-    scene.v = SplatGradients([torch.zeros(len(whole.parts[0]), 12)])
-    refused(RuntimeError, "project_bwd_step_: a table of gradients needs CUDA", scene.at_once)
-    scene.v = SplatGradients([whole.parts[0], whole.parts[3]])
-    refused(RuntimeError, "v_splats must be v_means2d, .* or one table, got 2 tensors", scene.backward)
 
 
 @pytest.mark.cuda

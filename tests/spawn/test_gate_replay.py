@@ -41,7 +41,7 @@ def test_a_replay_that_repeats_the_reference_matches_it_though_the_population_is
     assert main(["train", "--data", str(lineage_run / "capture"), "--out", limited, *flags]) == 0
     # At a rate of 0, an oracle vetoes nothing.
     arguments = ["gate", "replay", "default", limited, "--out", str(out), "--rate", "0"]
-    with pytest.warns(UserWarning, match="the limit of the population held back 82% of the reference's"):
+    with pytest.warns(UserWarning, match="the limit of the population held back 75% of the reference's"):
         assert main(arguments) == 0
     arms = {row["arm"]: row for row in json.loads((out / "replay.json").read_text())}
     for name in ("psnr", "final"):

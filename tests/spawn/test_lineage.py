@@ -25,6 +25,7 @@ from blitzgs.spawn.lineage import (
     read_lineage,
 )
 from blitzgs.table.placement import redistribute
+from blitzgs.table.table import GaussianTable
 from tests.distributed.rank_harness import run_ranks
 from tests.helpers import refused
 from tests.population.test_density import random_table
@@ -64,7 +65,7 @@ def test_a_run_of_events_is_logged_row_by_row(tmp_path):
     reports = []
     for event in range(1, 4):
         shaken(table, event)
-        before = {int(i): {n: table[n][row].clone() for n in table} for row, i in enumerate(table["id"])}
+        before = GaussianTable({name: table[name].clone() for name in table})
         reports.append(
             densify(
                 table, RULES, time=100 * event, step=event, seed=3, level_count=4, ranks=Ranks(), extent=2.0,
@@ -81,24 +82,14 @@ def test_a_run_of_events_is_logged_row_by_row(tmp_path):
     assert len(births["id"]) == 300 + grown
     assert (deaths["cause"] == Cause.SPLIT).sum() == sum(r.split for r in reports) > 10
     assert {Cause.OPACITY, Cause.SIZE} <= set(deaths["cause"].tolist())
-    last = np.flatnonzero(births["time"] == 300)
-    assert len(last) > 10
-    for row in last:
-        parent = before[int(births["parent"][row])]
-        count = max(int(parent["grad_count"]), 1)
-        want = {
-            "gradient": float(parent["grad_sum"]) / count,
-            "parent_opacity": float(parent["opacities"].sigmoid()),
-            "parent_scale": float(parent["scales"].exp().mean()) / 2.0,
-            "parent_age": 300 - int(parent["birth"]),
-            "views": int(parent["grad_count"]),
-            "level": min(int(parent["level"]) + int(births["is_split"][row]), 3),
-            "is_split": float(parent["scales"].max().exp() > RULES.clone_scale),
-            "parent_color_gradient": float(parent["exp_avg_sq.sh"][0].mean().sqrt()),
-            "parent_flatness": float((parent["scales"].min() - parent["scales"].max()).exp()),
-        }
-        for name, value in want.items():
-            assert births[name][row] == pytest.approx(value, rel=1e-5), name
+    last = births["time"] == 300
+    assert last.sum() > 10
+    place = {int(i): row for row, i in enumerate(before["id"])}
+    parents = torch.tensor([place[int(parent)] for parent in births["parent"][last]])
+    is_split = before["scales"][parents].amax(1).exp() > RULES.clone_scale
+    features = spawn_features(before, parents, is_split, 300, 2.0, 4)
+    for name, column in zip(FEATURES, features.T, strict=True):
+        np.testing.assert_array_equal(births[name][last], column, name)
     first = births["parent"] == -1
     assert first.sum() == 300 and np.isnan(births["gradient"][first]).all()
 

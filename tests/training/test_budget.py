@@ -4,6 +4,7 @@
 import json
 import math
 import random
+import shutil
 import warnings
 from dataclasses import replace
 from types import SimpleNamespace
@@ -283,30 +284,38 @@ def extend(folder, by):
     return Trainer(config, *tiny_scene(), folder, Ranks(), resume=True, extend=by)
 
 
-def test_an_interrupted_extension_ends_as_an_uninterrupted_one(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The folder of a finished run."""
+    folder = tmp_path_factory.mktemp("finished")
+    train(folder)
+    return folder
+
+
+def test_an_interrupted_extension_ends_as_an_uninterrupted_one(finished, tmp_path, monkeypatch):
     tables = []
     for name in ("whole", "parts"):
-        train(tmp_path / name)
+        folder = shutil.copytree(finished, tmp_path / name)
         if name == "whole":
-            running = extend(tmp_path / name, 1.4)
+            running = extend(folder, 1.4)
         else:
             with monkeypatch.context() as patch:
                 stop_at(patch, 120)
-                assert extend(tmp_path / name, 1.4).train() is None
-            refused(ConfigError, r"not finished \(120 of 140 images\)", extend, tmp_path / name, 2)
-            running = extend(tmp_path / name, None)
+                assert extend(folder, 1.4).train() is None
+            refused(ConfigError, r"not finished \(120 of 140 images\)", extend, folder, 2)
+            running = extend(folder, None)
         assert running.train()["images"] == 140
         tables.append(running.state.table)
-        assert json.loads((tmp_path / name / "summary.json").read_text())["images"] == 140
+        assert json.loads((folder / "summary.json").read_text())["images"] == 140
     assert_same_table(*tables)
 
 
 @pytest.mark.parametrize("by", [1.4, None])
-def test_an_extension_that_was_killed_before_its_first_checkpoint_goes_on(tmp_path, by):
-    train(tmp_path)
-    extend(tmp_path, 1.4).close()  # its configuration is written, its checkpoint is not
-    check_before_capture(tmp_path, load_config(tmp_path / run_files.CONFIG), extends=False)
-    assert extend(tmp_path, by).train()["images"] == 140
+def test_an_extension_that_was_killed_before_its_first_checkpoint_goes_on(finished, tmp_path, by):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    extend(folder, 1.4).close()  # its configuration is written, its checkpoint is not
+    check_before_capture(folder, load_config(folder / run_files.CONFIG), extends=False)
+    assert extend(folder, by).train()["images"] == 140
 
 
 def test_only_a_finished_run_becomes_longer():

@@ -251,7 +251,7 @@ def test_a_gate_withholds_candidates_from_its_onset_on(tmp_path):
         gated, _ = train(tmp_path / "gated", *flags)
     texts = [str(w.message) for w in warned if "spawn gate" in str(w.message)]
     assert any("fitted on this very capture" in text for text in texts)
-    assert any("population.grad_threshold (0.0001, here 0.0002)" in text for text in texts)
+    assert any("population.grad_threshold (0.0001, here 0.002)" in text for text in texts)
     events = require_vetoes_from_60(tmp_path / "gated")
     assert events[60]["held_back"] == events[80]["held_back"] == 0
     # The other rule withholds as many candidates, and other ones.

@@ -29,10 +29,11 @@ from tests.training.tiny import (
     trained_in_parts,
 )
 
-COUNT, VIEWS = 8000, 12
-RESIDENT = "memory.resident_gb=0.0078"
+COUNT, VIEWS = 4000, 12
+RESIDENT = "memory.resident_gb=0.0039"
 SETTINGS = (
-    "lod.visible_threshold=0", "schedule.iterations=60", "population.max_gaussians=40000",
+    "lod.visible_threshold=0", "schedule.iterations=60", "population.max_gaussians=20000",
+    "population.grad_threshold=2e-4",
 )  # fmt: skip
 TOUR = (RESIDENT, "memory.tour=true")
 
@@ -67,7 +68,7 @@ def assert_same_run(one, other):
 
 VARIANTS = {
     "plain": (),
-    "batches": ("schedule.batch_size=2", "memory.resident_gb=0.0118"),
+    "batches": ("schedule.batch_size=2", "memory.resident_gb=0.0065"),
     "resolution": ("schedule.resolution=[[2, 40]]",),
     "passes": (
         "population.importance=true", "schedule.t1=30", "schedule.t2=48", "view.cull=true", "view.lod=true",
@@ -140,7 +141,7 @@ def _train(ranks, folder, overrides):
 def test_two_ranks_share_a_run_beyond_their_memory(tmp_path):
     options = ("population.importance=true", "schedule.t1=30", "schedule.t2=0", "schedule.iterations=45")
     whole = run_ranks(_train, 2, tmp_path / "whole", options)
-    pooled = run_ranks(_train, 2, tmp_path / "pooled", (*options, "memory.resident_gb=0.006"))
+    pooled = run_ranks(_train, 2, tmp_path / "pooled", (*options, "memory.resident_gb=0.003"))
     expected, got = (
         {name: torch.cat([share[name] for share in shares]) for name in shares[0]}
         for shares in (whole, pooled)
@@ -184,7 +185,7 @@ def test_rows_are_sorted_for_a_pool_or_for_another_number_of_ranks(tmp_path):
 
 
 def test_a_batch_that_does_not_fit_is_named(tmp_path):
-    refused(PoolError, r"see \d+ blocks of 256 .* lower sch", train, tmp_path, "memory.resident_gb=0.002")
+    refused(PoolError, r"see \d+ blocks of 256 .* lower sch", train, tmp_path, "memory.resident_gb=0.001")
     assert not list((tmp_path / run_files.CHECKPOINTS).iterdir())
 
 
@@ -202,7 +203,7 @@ def test_a_batch_that_does_not_fit_is_named(tmp_path):
 )
 def test_what_outgrows_its_pool_costs_nothing_and_happens_with_a_larger_one(tmp_path, options, resumed):
     whole, _ = train(tmp_path / "whole", *options)
-    small = (tmp_path / "pooled", *options, "memory.resident_gb=0.0048")
+    small = (tmp_path / "pooled", *options, "memory.resident_gb=0.0026")
     refused(PoolError, r"The model so far is saved: continue with --resume", train, *small)
     if resumed == "resumed from":  # nothing new to save
         refused(PoolError, r"lower schedule.batch_size$", train, *small, resume=True)

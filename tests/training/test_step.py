@@ -183,9 +183,9 @@ def scratch_of_a_step(unseen: int, device: str) -> int:
 
 
 def test_scratch_of_a_step_does_not_grow_with_what_is_not_seen(device):
-    few, many = scratch_of_a_step(40_000, device), scratch_of_a_step(16 * 40_000, device)
+    few, many = scratch_of_a_step(SEEN, device), scratch_of_a_step(16 * SEEN, device)
     assert few > 8 * SEEN  # the step saw Gaussians, and its memory was measured
-    assert many <= 1.01 * few, f"{(many - few) / (15 * 40_000):.3f} bytes for each row that no view sees"
+    assert many <= 1.01 * few, f"{(many - few) / (15 * SEEN):.3f} bytes for each row that no view sees"
 
 
 GAINS = torch.tensor([0.8, 0.9, 1.0, 1.1, 1.2])
