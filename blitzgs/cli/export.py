@@ -147,7 +147,8 @@ def run(args: argparse.Namespace) -> None:
 
 def _refuse(args: argparse.Namespace, flags: Iterable[str], reason: str) -> None:
     for flag in flags:
-        if getattr(args, flag):
+        value = getattr(args, flag)
+        if value is not None and value is not False:  # 0 is given
             raise ValueError(f"--{flag.replace('_', '-')} {reason}")
 
 

@@ -271,7 +271,7 @@ def test_a_full_disk_is_named_by_the_check_and_not_by_the_lock(tmp_path, monkeyp
 def other(trained, tmp_path_factory):
     """Another run of the same capture."""
     folder = tmp_path_factory.mktemp("other") / "run"
-    flags = as_flags("config=defaults", *OVERRIDES, "schedule.scale=0.4")
+    flags = as_flags("config=defaults", *OVERRIDES, "population.grad_threshold=2e-4", "schedule.scale=0.4")
     assert main(["train", "--data", str(trained[0]), "--out", str(folder), *flags]) == 0
     return folder
 

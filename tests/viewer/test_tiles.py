@@ -186,7 +186,7 @@ def test_a_file_is_written_as_tiles_and_flags_choose(tmp_path, capsys, failure):
     save_ply(tmp_path / "large.ply", large)
     flags = ["--tiles", str(tmp_path / "spz"), "--spz-tiles", "--processes", "1"]
     assert main(["export", str(tmp_path / "large.ply"), *flags]) == 0
-    assert "SPZ holds scales to 379 units" in capsys.readouterr().err
+    assert "SPZ holds scales of 0.000045 to 379 units" in capsys.readouterr().err
     assert main(["export", str(tmp_path / "m.splat"), "--streamed-sog", str(tmp_path / "sog")]) == 0
     assert "sog is streamed SOG, which SuperSplat shows" in failure("view", tmp_path / "sog")
     for flags, reason in (

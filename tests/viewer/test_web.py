@@ -214,6 +214,7 @@ def test_wrong_flags_are_named(trained, tmp_path, failure):
     page, ply = ["--html", str(tmp_path / "a.html")], ["--ply", str(tmp_path / "a.ply")]
     for flags, reason in (
         ([*page, "--classic"], "--classic is not for --html"),
+        ([*page, "--min-opacity", "0"], "--min-opacity is not for --html"),
         ([*ply, "--max-mb", "3"], "--max-mb is for --html"),
         (["--html", str(tmp_path / "a.txt")], "choose a --html that ends in .html"),
         ([*page, "--max-mb", "0.001"], "choose a larger --max-mb"),

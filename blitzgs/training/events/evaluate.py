@@ -14,7 +14,7 @@ from blitzgs.capture.images import PhotographError
 from blitzgs.config.schedule import Event
 from blitzgs.frame.ownership import TileOwners
 from blitzgs.runs import run_files
-from blitzgs.runs.evaluation import EvaluationStoppedError, evaluate, evenly_ordered, worst_views
+from blitzgs.runs.evaluation import EvaluationStoppedError, Lpips, evaluate, evenly_ordered, worst_views
 from blitzgs.training.state import TrainingState
 from blitzgs.util.errors import warn
 from blitzgs.util.output import write_file
@@ -71,7 +71,9 @@ def _write_trained(state: TrainingState, indices: Sequence[int], folder: Path) -
         warn(f"the metrics of training views are not written: {error}")
 
 
-def measure(state: TrainingState, indices: Sequence[int], folder: Path | None) -> dict[str, Any]:
+def measure(
+    state: TrainingState, indices: Sequence[int], folder: Path | None, lpips: Lpips | None = None
+) -> dict[str, Any]:
     """Compare the model with photographs; see `evaluate`. Without a folder nothing is written."""
     state.catch_up()
     with state.log.work("views measured") as report:
@@ -84,6 +86,7 @@ def measure(state: TrainingState, indices: Sequence[int], folder: Path | None) -
             folder,
             TileOwners(state.ranks),
             pictures=PICTURES,
+            lpips=lpips,
             report=report,
             optional_files=True,
             stops=state.stops,
