@@ -56,7 +56,7 @@ class Group(NamedTuple):
     first_image: int  # number of its first view among the images of the call
     covariances: Decomposed | None  # given by the caller instead of quats and scales; None: none
     lenses: Lenses | None  # lenses and shutters of the views; None: pinhole cameras
-    ids: Tensor | None = None  # int64 [A], the rows of the caller's tables in `inputs`; None: all
+    ids: Tensor | None = None  # int32 [A], the rows of the caller's tables in `inputs`; None: all
 
 
 class ShTables(NamedTuple):
