@@ -60,9 +60,9 @@ def generate_city(
 
     `processes` render (None: one for each core that this process may use); `progress` is called after each
     image. TypeError, ValueError: a parameter is unknown, or out of range. FileExistsError: `out` holds
-    something else, which `overwrite` allows of a city, or another process is making it. BrokenProcessPool:
-    the system ended one of the processes, for example because memory ran out. ImportError: `embreex` is not
-    installed.
+    something else, which `overwrite` allows of a city. BlockingIOError: another process is making it.
+    BrokenProcessPool: the system ended one of the processes, for example because memory ran out. ImportError:
+    `embreex` is not installed.
     """
     options = CityOptions(**parameters)
     out = Path(out)

@@ -281,7 +281,7 @@ def _export_run(
                     f"{run_folder} has no geo.json, so its place in the world is unknown: use blitzgs align"
                 )
             model, crs, coordinates = in_world(model, frame), frame.crs, "auto"
-            up = frame.rotation @ up
+            up = None if up is None else frame.rotation @ up
     source = Selected(source_of(model, up), selection or Selection(), model.space.offset, kept, score)
     return source, export(source, model.space, kind, path, coordinates, crs)
 

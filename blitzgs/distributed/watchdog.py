@@ -84,7 +84,8 @@ def early_failure() -> str | None:
     """
     if os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True":
         return None  # rank 0 serves the store, and only when it joins
-    store = open_store("watchdog", host=False, timeout_seconds=5)
+    # Work of hours shall not end because the network or a busy host is slow for once.
+    store = open_store("watchdog", host=False, timeout_seconds=60)
     return str(store.get("failure").decode()) if store.check(["failure"]) else None
 
 
@@ -151,10 +152,14 @@ class Watchdog:
         keys = {rank: f"progress/{rank}" for rank in range(self.world_size)}
         begin, told = time.monotonic(), False
         while True:
-            with self.lock:
-                if self.store.check(list(keys.values())):
-                    return
-                missing = [str(rank) for rank, key in keys.items() if not self.store.check([key])]
+            try:
+                with self.lock:
+                    if self.store.check(list(keys.values())):
+                        return
+                    missing = [str(rank) for rank, key in keys.items() if not self.store.check([key])]
+            except RuntimeError as error:
+                text = "the job's store is gone: the process that served it has ended"
+                raise UserError(f"rank {self.rank} has not begun, because {text}") from error
             if failure := self._first_failure():
                 raise UserError(f"rank {self.rank} has not begun, because {failure}")
             waited = time.monotonic() - begin

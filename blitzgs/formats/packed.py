@@ -332,7 +332,10 @@ def write_spz(path: Path, source: GaussianSource, grid: SpzGrid | None = None) -
     The model is read twice, block by block, once if the grid is given; a temporary file in the same folder
     holds the columns. Gaussians too far away for the grid are left out.
     """
-    grid = grid or SpzGrid.of(source)
+    if grid is None:
+        grid = SpzGrid.of(source)
+        if grid.held < 0.9 * len(source):
+            raise ValueError(f"SPZ holds coordinates up to {1 << 22:,}, and many of the model are larger")
     count, widths, first, cut = grid.held, (9, 1, 3, 3, 4, _rest(source.degree)), 0, 0
     with new_file(path) as partial, tempfile.TemporaryFile(dir=path.parent) as file:
         for every in unit_blocks(source):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -161,9 +162,12 @@ def open_source(folder: Path, only: str | None = None) -> RunSource:
     return RunSource(path, manifest.shards, progress, space, config, lines)
 
 
-def up_of_run(folder: Path, space: Space) -> npt.NDArray[np.float64]:
-    """Return the upward direction of a run's capture, [3]."""
-    return up_direction([viewmat(camera, space) for camera in stored_cameras(folder).cameras])
+def up_of_run(folder: Path, space: Space) -> npt.NDArray[np.float64] | None:
+    """Return the upward direction of a run's capture, [3]; None: its cameras are unknown, or damaged."""
+    with suppress(ValueError):
+        if cameras := stored_cameras(folder).cameras:
+            return up_direction([viewmat(camera, space) for camera in cameras])
+    return None
 
 
 def _comments(

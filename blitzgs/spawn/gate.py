@@ -79,7 +79,7 @@ def write_info(path: Path, info: GateInfo) -> None:
 def check_no_other(path: Path) -> None:
     """Refuse to replace files that are not a gate's, as its metadata show (FileExistsError, OSError)."""
     metadata, otherwise = info_path(path), " and does not belong to a gate"
-    check_replaceable(metadata, (b'"features"',), otherwise)
+    check_replaceable(metadata, (b'{\n "format"',), otherwise)  # as `write_info` begins
     check_replaceable(path)
     if path.exists() and not metadata.exists():
         raise FileExistsError(f"{path} exists{otherwise}: choose another name")

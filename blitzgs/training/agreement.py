@@ -9,6 +9,7 @@ duration.
 from __future__ import annotations
 
 import math
+import os
 import signal
 import threading
 import time
@@ -41,7 +42,7 @@ class StopRequest:
 
     def __init__(self) -> None:
         self.number = 0
-        self._again = 0.0  # from when on a SIGINT is a second one
+        self._again = 0.0  # from when on a SIGINT is a second one: torchrun repeats the terminal's
         self._previous: dict[int, object] = {}
 
     def __enter__(self) -> StopRequest:
@@ -58,7 +59,7 @@ class StopRequest:
     def _note(self, number: int, frame: FrameType | None) -> None:
         # A closing terminal sends SIGHUP and SIGTERM together, so only a second SIGINT means "at once".
         if number == signal.SIGINT == self.number:
-            if time.monotonic() < self._again:
+            if "TORCHELASTIC_RUN_ID" in os.environ and time.monotonic() < self._again:
                 return
             raise KeyboardInterrupt
         self.number, self._again = number, time.monotonic() + REPEAT_SECONDS

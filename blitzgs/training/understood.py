@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from torch import Tensor
 
 from blitzgs.capture.cameras import Camera, Float64
 from blitzgs.capture.capture import Capture
@@ -31,6 +32,11 @@ _BLACK, _SATURATED = 4.0, 251.0
 # or a turned or cropped one by -0.2 to 0.2; among points that are mostly hidden, both are less. The least
 # number of points, the least correlation, and its least share of that of the other photographs.
 _LEAST_POINTS, _ALIKE, _AS_OTHERS = 100, 0.12, 0.3
+# Few photographs are named only if the median is clear, as right ones of rooms fall below too. Which share is
+# many.
+_CLEAR, _MANY = 0.5, 0.4
+# Cells of a side of the picture, and the contrast below which it says nothing, as of one colour, fog, night.
+_CELLS, _LEAST_CONTRAST = 20, 2.0
 
 
 class HopelessCaptureError(ValueError):
@@ -102,7 +108,7 @@ def _look(capture: Capture, images: ImageStore) -> Pictures:
                 pictures.unread.append(str(error))
             continue
         camera = capture.cameras[index]
-        pictures.likeness[camera.name] = _likeness(camera, image, points, colors)
+        pictures.likeness[camera.name] = _likeness(camera, image, mask, points, colors)
         step = max(1, min(image.shape[:2]) // 256)
         pixels = image[::step, ::step]
         if mask is None:
@@ -115,14 +121,22 @@ def _look(capture: Capture, images: ImageStore) -> Pictures:
     return pictures
 
 
-def _likeness(camera: Camera, image: UInt8, points: Float64, colors: UInt8) -> float:
-    """Return the correlation of the brightness of points and of their pixels; NaN: there are too few."""
-    seen, (x, y, _) = points_seen(camera, points)
-    if len(seen) < _LEAST_POINTS:
+def _likeness(camera: Camera, image: UInt8, mask: Tensor | None, points: Float64, colors: UInt8) -> float:
+    """Return the correlation of the brightness of points and of their pixels; NaN: it says nothing."""
+    seen, (x, y, depth) = points_seen(camera, points)
+    column, row = x.astype(int), y.astype(int)
+    # Of the points in a cell, the nearest hides the others.
+    cells = row * _CELLS // camera.height * _CELLS + column * _CELLS // camera.width
+    order = np.argsort(depth)
+    keep = order[np.unique(cells[order], return_index=True)[1]]
+    if mask is not None:
+        keep = keep[mask.numpy()[row[keep], column[keep]] != 0]
+    if len(keep) < _LEAST_POINTS:
         return math.nan
-    shown, expected = image[y.astype(int), x.astype(int)].mean(axis=1), colors[seen].mean(axis=1)
-    spread = shown.std() * expected.std()
-    return float(np.cov(shown, expected, ddof=0)[0, 1] / spread) if spread else math.nan
+    shown, expected = image[row[keep], column[keep]].mean(axis=1), colors[seen[keep]].mean(axis=1)
+    if min(shown.std(), expected.std()) < _LEAST_CONTRAST:
+        return math.nan
+    return float(np.corrcoef(shown, expected)[0, 1])
 
 
 def _warn_of_pictures(capture: Capture, pictures: Pictures, near: float) -> None:
@@ -146,9 +160,10 @@ def _warn_of_pictures(capture: Capture, pictures: Pictures, near: float) -> None
                 "the model starts with a wrong picture; are the colours read from the right fields?"
             )
     known = {name: likeness for name, likeness in pictures.likeness.items() if not math.isnan(likeness)}
-    least = max(_ALIKE, _AS_OTHERS * float(np.median(list(known.values())))) if known else 0.0
-    unlike = [name for name, likeness in known.items() if likeness < least]
-    if unlike and not capture.about.random_points:
+    middle = float(np.median(list(known.values()))) if known else 0.0
+    unlike = [name for name, likeness in known.items() if likeness < max(_ALIKE, _AS_OTHERS * middle)]
+    is_clear = middle > _CLEAR or len(unlike) > _MANY * len(known)
+    if unlike and is_clear and not capture.about.random_points:
         warn(
             f"{len(unlike)} of {len(known)} photographs that were looked at show other colours than the "
             f"points where these should be (first: {unlike[0]}): are they the photographs of these poses, "

@@ -112,7 +112,10 @@ def test_realitycapture_in_degrees_is_refused(tmp_path):
     path = capture.write_images(tmp_path) / "registration.csv"
     files.realitycapture(capture, path)
     assert len(read(tmp_path)[0]) == 6
-    capture.centres = capture.centres * [1e-5, 0.9e-5, 1.0] + [13.4, 52.5, 80.0]
+    usual, capture.centres = capture.centres, capture.centres * [1e-3, 1e-3, 1.0]  # of a mast
+    files.realitycapture(capture, path)
+    assert len(read(tmp_path)[0]) == 6
+    capture.centres = usual * [1e-5, 0.9e-5, 1.0] + [13.4, 52.5, 80.0]
     files.realitycapture(capture, path)
     refused(ValueError, "registration.csv: x and y are longitudes and latitudes, .* UTM", read, tmp_path)
     capture.centres = np.zeros((6, 3))  # a camera on a tripod

@@ -21,6 +21,7 @@ from blitzgs.distributed.group import (
     resolve_device,
 )
 from blitzgs.distributed.host_sum import HostSum
+from blitzgs.util.errors import UserError
 from tests.distributed.rank_harness import RankError, on_each_device, run_ranks
 from tests.helpers import refused
 
@@ -273,6 +274,17 @@ def test_a_process_that_ends_inside_its_job_stops_watching_first(monkeypatch):
     assert at_exit == [dogs[1].stop] and not dogs[0].thread.is_alive() and dogs[1].thread.is_alive()
     at_exit[0]()
     assert not dogs[1].thread.is_alive() and not at_exit
+
+
+def test_a_store_that_ends_before_the_ranks_have_joined_is_said(monkeypatch):
+    class Gone(HashStore):
+        def check(self, keys):
+            raise RuntimeError("Broken pipe")
+
+    monkeypatch.setattr(watchdog, "open_store", lambda *_args, **_options: Gone())
+    dog = watchdog.Watchdog(0, 2, 10.0)
+    refused(UserError, "rank 0 has not begun, because the job's store is gone", dog.await_start)
+    dog.stop()
 
 
 VIEWS = 3

@@ -234,7 +234,9 @@ def test_too_few_spawns_to_hold_some_out_are_refused(tmp_path):
 
 def test_a_fit_replaces_only_a_gate(tmp_path):
     path = tmp_path / "package.json"
-    for file, text in ((path, "the user's"), (info_path(path), "{}"), (info_path(path), "[" * 100_000)):
+    geojson = '{"type": "FeatureCollection", "features": []}'
+    others = ("{}", "[" * 100_000, geojson)
+    for file, text in ((path, "the user's"), *((info_path(path), text) for text in others)):
         file.write_text(text)
         with pytest.raises(FileExistsError, match=f"{file} exists and does not belong to a gate: choose"):
             fit([spawns("a")], path)

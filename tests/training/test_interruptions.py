@@ -104,7 +104,11 @@ def test_every_signal_saves(tmp_path, monkeypatch, number):
     assert signal.Signals(number).name in read_log(tmp_path)[-1]["reason"]
 
 
-def test_nohup_is_respected_and_a_second_signal_does_not_interrupt_the_save():
+@pytest.mark.parametrize("repeated", [False, True], ids=["terminal", "torchrun"])
+def test_nohup_is_respected_and_a_second_signal_does_not_interrupt_the_save(monkeypatch, repeated):
+    monkeypatch.delenv("TORCHELASTIC_RUN_ID", raising=False)
+    if repeated:
+        monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with StopRequest() as stop:
@@ -113,9 +117,10 @@ def test_nohup_is_respected_and_a_second_signal_does_not_interrupt_the_save():
             os.kill(os.getpid(), signal.SIGTERM)
             os.kill(os.getpid(), signal.SIGTERM)
             assert stop.number == signal.SIGTERM
-            for _ in range(2):  # the terminal's, and torchrun's
+            os.kill(os.getpid(), signal.SIGINT)
+            if repeated:
                 os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(REPEAT_SECONDS)
+                time.sleep(REPEAT_SECONDS)
             with pytest.raises(KeyboardInterrupt):
                 os.kill(os.getpid(), signal.SIGINT)
     finally:

@@ -147,14 +147,17 @@ def test_a_black_or_saturated_picture_is_predicted(data, capsys, value, what):
     assert [text for text in said if f"photographs that were looked at are {what}" in text]
 
 
-@pytest.mark.parametrize("wrong", [(), (3,), range(6)])
-@pytest.mark.parametrize("change", ["another", "turned", "mirrored", "cropped"])
-def test_photographs_that_do_not_show_the_points_are_named(change, wrong):
-    """Six cameras look straight down on a map; a pixel is a unit of length."""
+def said_of_colours(change="turned", wrong=(), points_like=None, behind=0):
+    """Return the warnings; six cameras look straight down on a map, and a pixel is a unit of length."""
     random = np.random.default_rng(0)
     ground, k = smooth_image(150, 200, 5), np.array([[60, 0, 32], [0, 60, 24], [0, 0, 1.0]])
     points = np.concatenate([random.uniform(0, [200, 150], (3000, 2)), np.zeros((3000, 1))], axis=1)
     colors = ground[points[:, 1].astype(int), points[:, 0].astype(int)] // 2 + 20  # another exposure
+    if points_like is not None:
+        colors[:] = points_like
+    hidden = np.concatenate([random.uniform(0, [200, 150], (behind, 2)), np.full((behind, 1), 20)], axis=1)
+    points = np.concatenate([points, hidden])
+    colors = np.concatenate([colors, random.integers(0, 255, (behind, 3), dtype=np.uint8)])
     cameras, shown = [], []
     for i in range(6):
         left, top = 22 * i, 16 * i
@@ -175,10 +178,21 @@ def test_photographs_that_do_not_show_the_points_are_named(change, wrong):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         _warn_of_pictures(capture, _look(capture, images), 0.01)
-    said = [str(w.message) for w in caught if "other colours than the points" in str(w.message)]
+    return [str(w.message) for w in caught if "other colours than the points" in str(w.message)]
+
+
+@pytest.mark.parametrize("wrong", [(), (3,), range(6)])
+@pytest.mark.parametrize("change", ["another", "turned", "mirrored", "cropped"])
+def test_photographs_that_do_not_show_the_points_are_named(change, wrong):
+    said = said_of_colours(change, wrong)
     assert len(said) == bool(wrong)
     if len(wrong) == 1:
         assert said[0].startswith("1 of 6 photographs") and "(first: 3.png)" in said[0]
+
+
+def test_hidden_points_and_points_of_one_colour_make_no_photograph_wrong():
+    assert not said_of_colours(points_like=(127, 127, 128))
+    assert not said_of_colours(behind=12000)
 
 
 def test_a_near_plane_beyond_the_points_is_predicted(data, capsys):

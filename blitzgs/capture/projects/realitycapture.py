@@ -87,6 +87,9 @@ def _check_metres(centres: Float64) -> None:
     if len(centres) < 2:
         return
     east, north, up = np.ptp(centres, axis=0)
+    # Cameras of a mast or a shaft are above each other, too: about zero where coordinates are local.
+    if (np.abs(centres[:, :2].mean(axis=0)) < 1).all():
+        return
     if (np.abs(centres[:, :2]) <= [180, 90]).all() and up > _ABOVE * max(east, north):
         raise ValueError(
             f"x and y are longitudes and latitudes, as they differ by {max(east, north):.3g} and alt by "
