@@ -262,16 +262,18 @@ def main(arguments: Sequence[str]) -> int:
     """Do one run; returns the exit status."""
     spec_path, result_path = map(Path, arguments)
     spec = RunSpec(**json.loads(spec_path.read_text()))
-    begin = time.monotonic()
+    result, begin = describe(spec), time.monotonic()
 
     def run() -> dict[str, Any]:
         train = train_ours if spec.strategy is None else train_opponent
-        with Ranks.from_environment(spec.device) as ranks:
-            found = (train if spec.grid is None else train_partition)(spec, ranks)
-        seconds = time.monotonic() - begin
-        return {"environment": environment(spec.device), "wall_seconds": seconds} | found
+        try:
+            with Ranks.from_environment(spec.device) as ranks:
+                found = (train if spec.grid is None else train_partition)(spec, ranks)
+        finally:
+            result["wall_seconds"] = time.monotonic() - begin
+        return {"environment": environment(spec.device)} | found
 
-    return work(describe(spec), result_path, run)
+    return work(result, result_path, run)
 
 
 if __name__ == "__main__":

@@ -195,6 +195,8 @@ def test_a_damaged_camera_file_says_what_to_do(copy, tmp_path, failure):
         (folder / "cameras.json").write_text(damage)
         message = failure("render", folder, "--out", tmp_path / "out")
         assert "cameras.json is damaged" in message and "--data" in message
+    assert main(["export", str(folder), "--ply", str(tmp_path / "a.ply")]) == 0
+    assert not any(" up " in line for line in read_ply(tmp_path / "a.ply").comments)
 
 
 # The configuration in the checkpoint is used.
