@@ -187,8 +187,10 @@ def render(
     Raises:
         ValueError: a shape does not fit, or the degree or the mode is not one of these.
     """
-    _check(means, quats, scales, opacities, colors, viewmat, K, sh_degree, render_mode)
-    tensors: Any = (tensor.double() for tensor in (means, quats, scales, opacities, colors, viewmat, K))
+    named = dict(means=means, quats=quats, scales=scales, opacities=opacities, colors=colors)
+    named |= dict(viewmat=viewmat, K=K)
+    _check(named, sh_degree, render_mode)
+    tensors: Any = (tensor.double() for tensor in named.values())
     view: dict[str, Any] = dict(width=width, height=height, near_plane=near_plane, far_plane=far_plane)
     splats = project_splats(*tensors, **view, sh_degree=sh_degree, eps2d=eps2d, antialiased=antialiased)
     geometry, depths = (splats.means2d, splats.conics, splats.opacities), splats.depths
@@ -204,32 +206,23 @@ def render(
     return ReferenceImage(torch.cat(parts[render_mode], dim=-1), alpha, result.cut, splats)
 
 
-def _check(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    sh_degree: int | None,
-    render_mode: str,
-) -> None:
+def _check(named: dict[str, Tensor], sh_degree: int | None, render_mode: str) -> None:
     if sh_degree not in (None, 0, 1, 2, 3):
         raise ValueError(f"sh_degree must be 0 to 3 or None, got {sh_degree!r}")
-    n, channels = means.shape[:1], colors.shape[-1:]
-    count = () if sh_degree is None else (max([(sh_degree + 1) ** 2, *colors.shape[-2:-1]]),)
-    for name, tensor, shape in (
-        ("means", means, (*n, 3)),
-        ("quats", quats, (*n, 4)),
-        ("scales", scales, (*n, 3)),
-        ("opacities", opacities, n),
-        ("colors", colors, (*n, *count, *channels)),
-        ("viewmat", viewmat, (4, 4)),
-        ("K", K, (3, 3)),
-    ):
-        if tensor.shape != shape:
-            raise ValueError(f"{name} must be {[*shape]}, got {[*tensor.shape]}")
+    n, colors = named["means"].shape[:1], named["colors"].shape
+    count = () if sh_degree is None else (max([(sh_degree + 1) ** 2, *colors[-2:-1]]),)
+    wanted = {
+        "means": (*n, 3),
+        "quats": (*n, 4),
+        "scales": (*n, 3),
+        "opacities": n,
+        "colors": (*n, *count, *colors[-1:]),
+        "viewmat": (4, 4),
+        "K": (3, 3),
+    }
+    for name, shape in wanted.items():
+        if named[name].shape != shape:
+            raise ValueError(f"{name} must be {[*shape]}, got {[*named[name].shape]}")
     if render_mode not in RENDER_MODES:
         raise ValueError(f"render_mode must be one of {', '.join(RENDER_MODES)}, got {render_mode!r}")
 

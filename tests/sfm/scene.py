@@ -8,6 +8,7 @@ import numpy as np
 from PIL import Image
 
 from blitzgs.capture.cameras import camera_centres
+from blitzgs.capture.capture import load_capture
 from blitzgs.capture.world import fit_similarity
 from tests.capture.helpers import write_image
 
@@ -98,3 +99,10 @@ def aligned(found: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarra
     between = np.einsum("nij,kj,nlk->nil", found[:, :3, :3], moved.rotation, truth[:, :3, :3])
     cosines = (np.trace(between, axis1=1, axis2=2) - 1) / 2
     return np.linalg.norm(moved.to_world(a) - b, axis=1), np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+
+
+def poses_of(capture, placed):
+    """Return the poses of a capture's photographs, and the true ones of the same photographs."""
+    views = [camera for camera in load_capture(capture).cameras if camera.name.startswith("view_")]
+    found = np.stack([camera.world_to_camera for camera in views])
+    return found, placed[[int(camera.name[5:-4]) for camera in views]]
