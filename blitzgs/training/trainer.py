@@ -323,6 +323,7 @@ class Trainer:
             self._stop_by(agreement.now(step).signal, saves=False)
             return None
         summary = metrics | run_figures(state, population) | residency
+        summary["warnings"] = list(dict.fromkeys(summary["warnings"] + self.warned))
         if state.ranks.rank == 0:
             write_picture(state, population)
             try:

@@ -208,7 +208,8 @@ def test_warnings_come_into_the_log(tmp_path, monkeypatch):
         warnings.warn("masks may be inverted", stacklevel=1)
     assert texts == ["masks may be inverted"]
     at_step(monkeypatch, 3, lambda trainer: trainer.warned.extend(texts * 2))
-    train(tmp_path, "schedule.iterations=20")
+    _, summary = train(tmp_path, "schedule.iterations=20")
+    assert summary["warnings"] == texts
     assert [event["warning"] for event in events_of(tmp_path, "warned")] == texts
 
 
