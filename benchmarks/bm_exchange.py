@@ -119,7 +119,7 @@ class Workload:
         """Divide the tiles of a batch as the trainer does."""
         if self.ranks.world_size == 1:
             return None
-        return self.owners.divide(keys, views.width, views.height, self.options.tile_size, LOSS_HALO)
+        return self.owners.divide(keys, views.width, views.height, LOSS_HALO)
 
     def batch(self, keys: list[int], views: Views) -> Batch:
         """Return views with grey photographs."""

@@ -19,12 +19,9 @@ from torch import Tensor
 import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs.call.extras import Pixels
 from blitzgs.ops.derivatives import linear_map
-from blitzgs.ops.intersect import TileGrid
+from blitzgs.ops.intersect import TILE_SIZE, TileGrid
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
 from blitzgs.ops.rasterize import MetaGeometry
-
-# The tile size of the CUDA kernels. If the caller asks for another one, only meta's lists have it.
-CUDA_TILE_SIZE = 16
 
 
 class Places(NamedTuple):
@@ -194,9 +191,10 @@ def lists_of(
         return Lists(entries, offsets, grid)
 
     lists = listed_by(projection.tile_size, count)
-    if not splats.means2d.is_cuda or projection.tile_size == CUDA_TILE_SIZE:
+    if not splats.means2d.is_cuda or projection.tile_size == TILE_SIZE:
         return lists, lists
-    return lists, listed_by(CUDA_TILE_SIZE, -1)
+    # The CUDA kernels composite tiles of one size alone: only meta's lists have that which was asked for.
+    return lists, listed_by(TILE_SIZE, -1)
 
 
 def _lists_of_pixels(splats: ProjectedSplats, grid: TileGrid, pixels: Pixels) -> Lists:

@@ -15,7 +15,6 @@ from torch import Tensor
 from blitzgs._torch import not_compiled
 from blitzgs.call.arguments import (
     ANY,
-    DEFAULT_TILE_SIZE,
     GSPLAT_DEFAULTS,
     KERNEL_SH_DEGREE,
     RENDER_MODES,
@@ -30,6 +29,7 @@ from blitzgs.call.channels import ImageOptions, background_rows
 from blitzgs.call.rasterize import rasterization
 from blitzgs.call.render import ShTables, gathered_groups, groups_may_be_queued, groups_of, render
 from blitzgs.ops.derivatives import of_shape
+from blitzgs.ops.intersect import TILE_SIZE
 
 
 @not_compiled
@@ -49,7 +49,7 @@ def raw_rasterization(
     radius_clip: float = 0.0,
     eps2d: float = 0.3,
     sh_degree: int | None = None,
-    tile_size: int | None = DEFAULT_TILE_SIZE,
+    tile_size: int | None = TILE_SIZE,
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
     sparse_grad: bool = True,

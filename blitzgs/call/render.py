@@ -21,7 +21,7 @@ from blitzgs.call.bad_values import CamerasOnHost, check_intrinsics, watch_for_n
 from blitzgs.call.channels import ImageOptions, channels_of, split_channels
 from blitzgs.call.covariances import Decomposed, shaped_by
 from blitzgs.call.extras import Pixels
-from blitzgs.call.layout import CUDA_TILE_SIZE, Layout, Lists, lists_of
+from blitzgs.call.layout import Layout, Lists, lists_of
 from blitzgs.call.meta import make_meta
 from blitzgs.call.ranks import send_splats
 from blitzgs.distributed.group import Ranks
@@ -29,7 +29,7 @@ from blitzgs.frame.render import run_attempts
 from blitzgs.frame.transport.protocol import Exchange, LocalTransport
 from blitzgs.ops.derivatives import rows_of_tables
 from blitzgs.ops.importance import pixel_splats
-from blitzgs.ops.intersect import TileGrid
+from blitzgs.ops.intersect import TILE_SIZE, TileGrid
 from blitzgs.ops.project import differentiable_splats, gaussian_tensors, project_splats
 from blitzgs.ops.projection_types import (
     MAX_VIEWS,
@@ -341,4 +341,4 @@ def groups_may_be_queued(groups: Sequence[Group]) -> bool:
     if len(groups) > 1 or groups[0].covariances is not None or groups[0].lenses is not None:
         return False
     means, options = groups[0].inputs.gaussians[0], groups[0].inputs.options
-    return means.shape[0] > 0 and (not means.is_cuda or options.tile_size == CUDA_TILE_SIZE)
+    return means.shape[0] > 0 and (not means.is_cuda or options.tile_size == TILE_SIZE)

@@ -26,7 +26,7 @@ from blitzgs.frame.transport.protocol import (
     stage_ended,
 )
 from blitzgs.ops.blocks import ActiveRows
-from blitzgs.ops.intersect import TileGrid
+from blitzgs.ops.intersect import TILE_SIZE, TileGrid
 from blitzgs.ops.projection_types import (
     ProjectedSplats,
     ProjectionInputs,
@@ -49,7 +49,6 @@ class RenderOptions:
     eps2d: float = 0.3  # screen-space blur, pixels squared
     antialiased: bool = False  # compensate that blur in the opacities
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB behind everything
-    tile_size: int = 16  # pixels
     deterministic: bool = False  # gradients repeat bit for bit on CUDA too (they always do on the CPU)
     fade: tuple[float, ...] = ()  # `blitzgs.view.gate.LodGate.fade`; empty: opacities do not fade
 
@@ -63,7 +62,6 @@ class RenderOptions:
         return ProjectionOptions(
             width=views.width,
             height=views.height,
-            tile_size=self.tile_size,
             sh_degree=self.sh_degree,
             near_plane=self.near_plane,
             far_plane=self.far_plane,
@@ -130,7 +128,7 @@ def render_frame(
         ranks shared the work.
     """
     transport = transport or open_transport(None if assignment is None else assignment.ranks)
-    grid = tile_grid(views, options, assignment)
+    grid = tile_grid(views, assignment)
     if backgrounds is None:
         backgrounds = _backgrounds(options.background, len(views), views.viewmats.device)
 
@@ -208,10 +206,10 @@ def tile_lists(exchange: Exchange, grid: TileGrid) -> list[Tensor]:
     return list(lists)
 
 
-def tile_grid(views: Views, options: RenderOptions, assignment: TileAssignment | None) -> TileGrid:
+def tile_grid(views: Views, assignment: TileAssignment | None) -> TileGrid:
     """Return the grid of tiles, with the range of them that this rank composites."""
     tiles = (0, -1) if assignment is None else assignment.composited_tiles
-    return TileGrid(len(views), views.width, views.height, options.tile_size, *tiles)
+    return TileGrid(len(views), views.width, views.height, TILE_SIZE, *tiles)
 
 
 @lru_cache(maxsize=16)
@@ -228,7 +226,7 @@ def backward_splats(frame: Frame, v_renders: Tensor) -> SplatGradients:
     """
     views, options, way_back = frame.views, frame.options, frame.way_back
     tiles = (0, -1) if frame.assignment is None else frame.assignment.own_tiles
-    grid = TileGrid(len(views), views.width, views.height, options.tile_size, *tiles)
+    grid = TileGrid(len(views), views.width, views.height, TILE_SIZE, *tiles)
     if way_back is not None:
         way_back.check_still_valid()
     table = frame.gradients.take(frame.splats.means2d) if v_renders.is_cuda else None
@@ -312,7 +310,7 @@ def survey(
     """
     transport = transport or open_transport(None if assignment is None else assignment.ranks)
     inputs = inputs_of(table, views, options, active, colored=False)
-    grid = tile_grid(views, options, assignment)
+    grid = tile_grid(views, assignment)
 
     def attempt(capacity: Sizes | None) -> tuple[Exchange, tuple[Tensor, Tensor, Tensor]]:
         exchange = transport.project_and_send(inputs, assignment, capacity)

@@ -12,6 +12,7 @@ from torch import Tensor
 from blitzgs._library import below_autograd
 from blitzgs.ops.derivatives import first_only, full_gradients
 from blitzgs.ops.host import to_host
+from blitzgs.ops.intersect import TILE_SIZE
 from blitzgs.ops.projection_types import (
     N_OPTIONS,
     ProjectedSplats,
@@ -137,7 +138,7 @@ def project(
     *,
     active_ids: Tensor | None = None,
     active_views: Tensor | None = None,
-    tile_size: int = 16,
+    tile_size: int = TILE_SIZE,
     sh_degree: int = 0,
     near_plane: float = 0.01,
     far_plane: float = 1e10,

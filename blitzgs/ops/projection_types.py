@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs.ops.intersect import TILE_SIZE
 
 # Largest number of views of one launch (kMaxViews of csrc/common/kernel.h): an int32 has a bit for each.
 MAX_VIEWS = 32
@@ -101,7 +102,7 @@ class ProjectionOptions(NamedTuple):
 
     width: int
     height: int
-    tile_size: int = 16
+    tile_size: int = TILE_SIZE
     sh_degree: int = 0
     near_plane: float = 0.01
     far_plane: float = 1e10

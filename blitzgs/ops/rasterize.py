@@ -7,7 +7,6 @@ Also the gradients of splats, in the two layouts in which compositing hands them
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -17,7 +16,7 @@ from torch import Tensor
 
 from blitzgs._library import below_autograd
 from blitzgs.ops.derivatives import first_only
-from blitzgs.ops.intersect import TileGrid, pixels_of_tiles
+from blitzgs.ops.intersect import TILE_SIZE, TileGrid
 from blitzgs.util.errors import check_tensors
 
 # Where the parts of a splat gradient begin in its floats (csrc/common/kernel.h), and how many these are.
@@ -54,7 +53,7 @@ def rasterize(
     n_cameras: int,
     width: int,
     height: int,
-    tile_size: int = 16,
+    tile_size: int = TILE_SIZE,
     backgrounds: Tensor | None = None,
     tile_begin: int = 0,
     tile_end: int = -1,
@@ -126,8 +125,7 @@ def rasterize(
         call = _Call(splats, grid, store_absgrad, arrange, backward_follows, composited)
         renders, alphas = _Rasterize.apply(*geometry, colors, backgrounds, call)  # type: ignore[no-untyped-call]
     if (tile_begin, tile_end) != (0, -1):
-        end = sys.maxsize if tile_end < 0 else tile_end
-        alphas = alphas * pixels_of_tiles(n_cameras, width, height, tile_size, tile_begin, end, alphas.device)
+        alphas = alphas * grid.owned_pixels(alphas.device)
     return renders, alphas
 
 

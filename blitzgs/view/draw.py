@@ -75,7 +75,7 @@ class Drawer:
         ranges = assignment = None
         if ranks.world_size > 1:
             self._together(lambda: _reserve(subject.gaussians, look, device))
-            ranges = self._owners.divide([None], look.width, look.height, options.tile_size)
+            ranges = self._owners.divide([None], look.width, look.height)
             assignment = TileAssignment(ranks, ranges)
         depths = [options.near_plane, options.far_plane]
         if assignment is None and self._in_layers:
@@ -223,8 +223,7 @@ def _channels(frame: Frame, mode: Mode) -> Tensor:
     tiles = (0, -1) if frame.assignment is None else frame.assignment.composited_tiles
     depth, _ = rasterize(
         splats.means2d, splats.conics, splats.opacities, splats.depths[:, None], *frame.saved.lists,
-        n_cameras=1, width=views.width, height=views.height, tile_size=frame.options.tile_size,
-        tile_begin=tiles[0], tile_end=tiles[1],
+        n_cameras=1, width=views.width, height=views.height, tile_begin=tiles[0], tile_end=tiles[1],
     )  # fmt: skip
     return depth
 
