@@ -27,7 +27,7 @@ from blitzgs.call.arguments import (
 )
 from blitzgs.call.channels import ImageOptions, background_rows
 from blitzgs.call.rasterize import rasterization
-from blitzgs.call.render import ShTables, gathered_groups, groups_may_be_queued, groups_of, render
+from blitzgs.call.render import ShTables, render
 from blitzgs.ops.derivatives import of_shape
 from blitzgs.ops.intersect import TILE_SIZE
 
@@ -131,13 +131,7 @@ def raw_rasterization(
         for optimizer in lazy:
             optimizer.catch_up(sh_params.values(), rows, count)
 
-    groups = groups_of(gaussians, projection)
-    tables = ShTables(harmonics if shaded else (), catch_up_sh)
-    if groups_may_be_queued(groups):
-        return render(gaussians, projection, image, tables=tables, groups=groups)
-    # Several groups, no Gaussians, or another tile size: gather the Gaussians that any group sees.
-    groups = gathered_groups(groups, tables, sparse_grad)
-    return render(gaussians, projection, image, groups=groups)
+    return render(gaussians, projection, image, tables=ShTables(harmonics if shaded else (), catch_up_sh))
 
 
 @cache

@@ -30,7 +30,7 @@ from blitzgs.frame.transport.protocol import Exchange, LocalTransport
 from blitzgs.ops.derivatives import rows_of_tables
 from blitzgs.ops.importance import pixel_splats
 from blitzgs.ops.intersect import TILE_SIZE, TileGrid
-from blitzgs.ops.project import differentiable_splats, gaussian_tensors, project_splats
+from blitzgs.ops.project import differentiable_splats, project_splats
 from blitzgs.ops.projection_types import (
     MAX_VIEWS,
     VIEW_TOTALS,
@@ -49,7 +49,7 @@ _EXACT = LocalTransport(exact=True)
 _LISTS, _IMAGES = 2, 8
 
 
-class Group(NamedTuple):
+class _Group(NamedTuple):
     """Views of one scene that are projected together."""
 
     inputs: ProjectionInputs
@@ -72,23 +72,22 @@ def render(
     gaussians: Gaussians,
     projection: ProjectionOptions,
     image: ImageOptions,
-    tables: ShTables | None = None,  # the SH, if only visible rows are read (`groups_may_be_queued`)
     ranks: Ranks | None = None,  # among which Gaussians and views are divided; None: all here
-    groups: Sequence[Group] | None = None,  # `groups_of` Gaussians with SH, if already known
+    tables: ShTables | None = None,  # the SH, if only the rows of visible Gaussians are read
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render images; return the results of `blitzgs.rasterization`."""
     compiling = torch.compiler.is_compiling()
-    nan_marks: list[Tensor] = []
-    if groups is None:
-        shown, nan_marks = _without_non_finite(gaussians)
-        groups = groups_of(shown, projection)
+    shown, nan_marks = _without_non_finite(gaussians)
+    groups = _groups_of(shown, projection)
     with_others = gaussians.signals is not None or image.normals
     only_colors = gaussians.sh_degree is not None and not with_others and image.render_mode == "RGB"
     queued, cameras = None, None
-    if ranks is None and not compiling and image.pixels is None and groups_may_be_queued(groups):
+    if ranks is None and not compiling and image.pixels is None and _may_be_queued(groups):
         queued = _render_queued(groups[0].inputs, gaussians, image, only_colors, tables)
-        splats = differentiable_splats(queued.inputs, image.sparse_grad and tables is None, queued.splats)
+        splats = queued.splats
     else:
+        if tables is not None:
+            groups = _of_visible_rows(groups, tables, image.sparse_grad)
         cameras = None if compiling else CamerasOnHost(gaussians)
         splats = _project_groups(groups, image.sparse_grad)
     # As in gsplat, Gaussians without a splat have their own opacity.
@@ -133,10 +132,9 @@ def render(
 
 
 class _Queued(NamedTuple):
-    """The outputs of the ops; see each op for its fields."""
+    """What `_render_queued` returns."""
 
-    splats: ProjectedSplats
-    inputs: ProjectionInputs  # what the splats were projected from, in autograd's graph
+    splats: ProjectedSplats  # in autograd's graph
     lists: Lists
     composited: Sequence[Tensor]  # what `rasterize_fwd` returned, and alphas
     has_blank_view: bool  # whether some view sees no Gaussian
@@ -149,7 +147,7 @@ def _render_queued(
     only_colors: bool,  # whether the colours that the projection computes are all channels
     tables: ShTables | None,  # the SH, if they are not part of `inputs`
 ) -> _Queued:
-    """Render without gradients; the host queues all work first if earlier calls had the same size."""
+    """Project, list and composite; the host queues all of it first if earlier calls had the same size."""
     options, means, signals = inputs.options, inputs.gaussians[0], gaussians.signals
     rows_of, sh = ((), ()) if tables is None else (inputs.gaussians, tables.parts)
     # Hooks on saved tensors (checkpointing) need the same shapes each time, without spare capacity.
@@ -188,9 +186,10 @@ def _render_queued(
         colors, numbers, ids, *found = of_rows
         splats = splats._replace(colors=colors, visible_ids=numbers)
         inputs = inputs._replace(gaussians=rows_of_tables([*rows_of, *sh], ids, image.sparse_grad, found))
-    has_blank_view = 0 in rest[VIEW_TOTALS - 3 :]
+    splats = differentiable_splats(inputs, image.sparse_grad and tables is None, splats)
     grid = TileGrid(inputs.n_views, options.width, options.height, options.tile_size)
-    return _Queued(splats, inputs, Lists(isect_splats, tile_offsets, grid), images, has_blank_view)
+    has_blank_view = 0 in rest[VIEW_TOTALS - 3 :]
+    return _Queued(splats, Lists(isect_splats, tile_offsets, grid), images, has_blank_view)
 
 
 @lru_cache(maxsize=16)
@@ -272,7 +271,7 @@ def _without_non_finite(gaussians: Gaussians) -> tuple[Gaussians, list[Tensor]]:
     return gaussians._replace(scenes=scenes), nan_marks
 
 
-def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
+def _groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[_Group]:
     """Divide the views into groups; one scene of up to 32 views with common colours is one group."""
     groups = []
     sh_per_view = gaussians.per_view and gaussians.sh_degree is not None
@@ -284,28 +283,25 @@ def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
             views = list(zip(scene.viewmats.split(most), scene.Ks.split(most), strict=True))
         sh = _sh_of_views(gaussians, scene, len(views))
         for part, (viewmats, Ks) in enumerate(views):
-            own = gaussian_tensors(scene.means, scene.quats, scene.scales, scene.opacities, sh[part])
+            own = [scene.means, scene.quats, scene.scales, scene.opacities, *sh[part]]
             inputs = ProjectionInputs(own, (viewmats, Ks), options)
             lenses = scene.lenses and scene.lenses.rows(part * most, (part + 1) * most)
-            groups.append(Group(inputs, s * n_views + part * most, scene.covariances, lenses))
+            groups.append(_Group(inputs, s * n_views + part * most, scene.covariances, lenses))
     return groups
 
 
-def _sh_of_views(gaussians: Gaussians, scene: Scene, parts: int) -> Sequence[Tensor | None]:
-    """Return the SH that each part of a scene's views is rendered with."""
+def _sh_of_views(gaussians: Gaussians, scene: Scene, parts: int) -> list[list[Tensor]]:
+    """Return the SH that each part of a scene's views is rendered with; an empty list for none."""
     if gaussians.sh_degree is None or scene.colors is None:
-        return (None,) * parts
+        return [[]] * parts
     if not gaussians.per_view:
-        return (scene.colors,) * parts
+        return [[scene.colors]] * parts
     # Without views there is still one part, and the sum over no views is a zero for each coefficient.
-    return scene.colors.unbind(0) if scene.colors.shape[0] else (scene.colors.sum(dim=0),)
+    return [[sh] for sh in scene.colors.unbind(0)] if scene.colors.shape[0] else [[scene.colors.sum(dim=0)]]
 
 
-def gathered_groups(groups: Sequence[Group], sh: ShTables, sparse_grad: bool) -> list[Group]:
-    """Return groups of the Gaussians alone that a view of any group sees.
-
-    `groups`: of one scene, without SH. `sparse_grad`: whether the tables get sparse gradients.
-    """
+def _of_visible_rows(groups: Sequence[_Group], sh: ShTables, sparse_grad: bool) -> list[_Group]:
+    """Return groups, of one scene without SH, of the Gaussians alone that a view of any group sees."""
     tables = groups[0].inputs.gaussians
     with torch.no_grad():
         ids = torch.cat([project_splats(group.inputs).visible_ids for group in groups]).unique()
@@ -314,7 +310,7 @@ def gathered_groups(groups: Sequence[Group], sh: ShTables, sparse_grad: bool) ->
     return [group._replace(inputs=group.inputs._replace(gaussians=rows), ids=ids) for group in groups]
 
 
-def _project_groups(groups: Sequence[Group], sparse_grad: bool) -> ProjectedSplats:
+def _project_groups(groups: Sequence[_Group], sparse_grad: bool) -> ProjectedSplats:
     """Return the splats of all images, group by group; their camera_ids number all images of the call.
 
     Of several groups, visible_ids and splat_offsets have no meaning.
@@ -336,7 +332,7 @@ def _project_groups(groups: Sequence[Group], sparse_grad: bool) -> ProjectedSpla
     return ProjectedSplats._make((*map(torch.cat, columns), torch.stack(counts).sum(dim=0)))
 
 
-def groups_may_be_queued(groups: Sequence[Group]) -> bool:
+def _may_be_queued(groups: Sequence[_Group]) -> bool:
     """Tell whether the work of a call may be queued before the host knows the number of splats."""
     if len(groups) > 1 or groups[0].covariances is not None or groups[0].lenses is not None:
         return False

@@ -192,16 +192,9 @@ def project(
     options = ProjectionOptions(
         width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw
     )
-    gaussians = gaussian_tensors(means, quats, scales, opacities, sh)
+    gaussians = [means, quats, scales, opacities, *([] if sh is None else [sh])]
     inputs = ProjectionInputs(gaussians, (viewmats, Ks), options, (active_ids, active_views))
     return differentiable_splats(inputs, sparse_grad)
-
-
-def gaussian_tensors(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor | None
-) -> list[Tensor]:
-    """Return `ProjectionInputs.gaussians`."""
-    return [means, quats, scales, opacities, *([] if sh is None else [sh])]
 
 
 def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
