@@ -18,9 +18,8 @@ from torch import Tensor
 from blitzgs._torch import hooks_on_saved_tensors
 from blitzgs.call.arguments import Gaussians, Scene
 from blitzgs.call.bad_values import CamerasOnHost, check_intrinsics, watch_for_non_finite
-from blitzgs.call.channels import ImageOptions, channels_of, split_channels
+from blitzgs.call.channels import ImageOptions, channels_of, images_of_caller
 from blitzgs.call.covariances import Decomposed, shaped_by
-from blitzgs.call.extras import Pixels
 from blitzgs.call.layout import Layout, Lists, lists_of
 from blitzgs.call.meta import make_meta
 from blitzgs.call.ranks import send_splats
@@ -28,7 +27,6 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.frame.render import run_attempts
 from blitzgs.frame.transport.protocol import Exchange, LocalTransport
 from blitzgs.ops.derivatives import rows_of_tables
-from blitzgs.ops.importance import pixel_splats
 from blitzgs.ops.intersect import TILE_SIZE, TileGrid
 from blitzgs.ops.project import differentiable_splats, project_splats
 from blitzgs.ops.projection_types import (
@@ -79,17 +77,13 @@ def render(
     compiling = torch.compiler.is_compiling()
     shown, nan_marks = _without_non_finite(gaussians)
     groups = _groups_of(shown, projection)
-    with_others = gaussians.signals is not None or image.normals
-    only_colors = gaussians.sh_degree is not None and not with_others and image.render_mode == "RGB"
     queued, cameras = None, None
     if ranks is None and not compiling and image.pixels is None and _may_be_queued(groups):
-        queued = _render_queued(groups[0].inputs, gaussians, image, only_colors, tables)
+        queued = _render_queued(groups[0].inputs, gaussians, image, tables)
         splats = queued.splats
     else:
-        if tables is not None:
-            groups = _of_visible_rows(groups, tables, image.sparse_grad)
         cameras = None if compiling else CamerasOnHost(gaussians)
-        splats = _project_groups(groups, image.sparse_grad)
+        splats = _project_groups(groups, image.sparse_grad, tables)
     # As in gsplat, Gaussians without a splat have their own opacity.
     over_all = not (image.packed or projection.antialiased or image.sparse_grad)
     under = gaussians.opacities if over_all else None
@@ -97,7 +91,8 @@ def render(
     rendered, meta_geometry = layout.splats_to_composite(
         gathered=compiling or ranks is not None, depths=image.render_mode != "RGB" or image.median
     )
-    channels = rendered.colors if only_colors else channels_of(rendered, gaussians, image)
+    store_absgrad = layout.absgrad_store() if image.absgrad else None
+    channels = channels_of(rendered, gaussians, image)
     lead = gaussians.lead
     if ranks is not None:
         lead = (gaussians.views // ranks.world_size,)
@@ -115,8 +110,8 @@ def render(
         rendered.means2d, rendered.conics, rendered.opacities, channels,
         composited_lists.splats, composited_lists.offsets, n_cameras=images, width=projection.width,
         height=projection.height, tile_size=composited_lists.grid.tile_size, backgrounds=image.backgrounds,
-        store_absgrad=layout.absgrad_store() if image.absgrad else None,
-        composited=None if queued is None else queued.composited, meta_geometry=meta_geometry,
+        store_absgrad=store_absgrad, composited=None if queued is None else queued.composited,
+        meta_geometry=meta_geometry,
     )  # fmt: skip
     if not compiling:
         # A view with a bad camera sees no Gaussian. Reading `cameras` does not wait: they were copied before.
@@ -125,8 +120,9 @@ def render(
             check_intrinsics(gaussians.named["Ks"])
             suspects_cameras = True
         watch_for_non_finite(gaussians, layout, nan_marks, suspects_cameras)
-    median = _median_depths(rendered, composited_lists, image.pixels) if image.median else None
-    renders, alphas, others = _images_of_caller(renders, alphas, median, gaussians, image, lead)
+    renders, alphas, others = images_of_caller(
+        renders, alphas, gaussians, image, lead, rendered, composited_lists
+    )
     arrived = None if ranks is None else rendered
     return renders, alphas, make_meta(gaussians, layout, others, lists, lead, arrived)
 
@@ -144,7 +140,6 @@ def _render_queued(
     inputs: ProjectionInputs,
     gaussians: Gaussians,
     image: ImageOptions,
-    only_colors: bool,  # whether the colours that the projection computes are all channels
     tables: ShTables | None,  # the SH, if they are not part of `inputs`
 ) -> _Queued:
     """Project, list and composite; the host queues all of it first if earlier calls had the same size."""
@@ -163,9 +158,7 @@ def _render_queued(
         splats = projected.splats
         if tables is not None:
             tables.before(splats.visible_ids, projected.n_visible if has_spare else None)
-        channels = None
-        if not sh:
-            channels = splats.colors if only_colors else channels_of(splats, gaussians, image, not exact)
+        channels = None if sh else channels_of(splats, gaussians, image, not exact)
         outputs = torch.ops.blitzgs.render(
             splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids,
             splats.visible_ids, splats.splat_offsets, splats.radii, splats.tiles_touched,
@@ -196,47 +189,6 @@ def _render_queued(
 def _transport(_device: torch.device, _gaussians: int, _views: int) -> LocalTransport:
     """Return the transport, with its estimate of sizes, of all calls of this size."""
     return LocalTransport()
-
-
-def _images_of_caller(
-    renders: Tensor,  # all channels, [I, H, W, channels]
-    alphas: Tensor,  # [I, H, W]
-    median: Tensor | None,  # median depths, [I, H, W, 1] or of M pixels [M, 1]
-    gaussians: Gaussians,
-    image: ImageOptions,
-    lead: tuple[int, ...],  # batch dimensions, and the number of views that are rendered here
-) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-    """Return images and alphas as the caller asked for them, and the further images of `meta` by key."""
-    alphas = alphas.unsqueeze(-1)
-    if image.pixels is not None:
-        renders, alphas = (t.flatten(0, 2).index_select(0, image.pixels.numbers) for t in (renders, alphas))
-    others: dict[str, Tensor] = {}
-    if gaussians.signals is not None or image.normals:
-        renders, others = split_channels(renders, gaussians, image)
-    if median is not None:
-        others["render_median"] = median
-    if image.render_mode.endswith("ED"):
-        # Autograd saves the divisor. It is a copy, so that the caller may change alphas in place.
-        covered = alphas.clone().clamp_(min=1e-10)
-        renders = torch.cat([renders[..., :-1], renders[..., -1:] / covered], dim=-1)
-    if len(lead) > 1 and image.pixels is None:
-        shape = (*lead, *renders.shape[1:3])
-        renders, alphas = renders.view(*shape, renders.shape[-1]), alphas.view(*shape, 1)
-        others = {key: values.view(*shape, values.shape[-1]) for key, values in others.items()}
-    return renders, alphas, others
-
-
-def _median_depths(splats: ProjectedSplats, lists: Lists, pixels: Pixels | None) -> Tensor:
-    """Return the depth of the splat at which half the light of each pixel is gone, [I, H, W, 1] or [M, 1]."""
-    n_cameras, width, height, tile_size, *_ = lists.grid
-    found = pixel_splats(
-        splats.means2d, splats.conics, splats.opacities, lists.splats, lists.offsets, n_cameras=n_cameras,
-        width=width, height=height, tile_size=tile_size, pixels=None if pixels is None else pixels.numbers,
-    )  # fmt: skip
-    # Before the first splat stands the depth of a pixel without splats.
-    table = torch.cat([splats.depths.new_zeros(1), splats.depths])
-    depths = table.index_select(0, found.medians + 1)
-    return depths.view(-1, 1) if pixels is not None else depths.view(n_cameras, height, width, 1)
 
 
 def _nan_or_zero(table: Tensor) -> Tensor:
@@ -310,11 +262,13 @@ def _of_visible_rows(groups: Sequence[_Group], sh: ShTables, sparse_grad: bool) 
     return [group._replace(inputs=group.inputs._replace(gaussians=rows), ids=ids) for group in groups]
 
 
-def _project_groups(groups: Sequence[_Group], sparse_grad: bool) -> ProjectedSplats:
+def _project_groups(groups: Sequence[_Group], sparse_grad: bool, tables: ShTables | None) -> ProjectedSplats:
     """Return the splats of all images, group by group; their camera_ids number all images of the call.
 
     Of several groups, visible_ids and splat_offsets have no meaning.
     """
+    if tables is not None:
+        groups = _of_visible_rows(groups, tables, sparse_grad)
     parts = []
     for group in groups:
         if group.lenses is not None:
