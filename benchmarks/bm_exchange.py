@@ -103,8 +103,7 @@ class Workload:
         table, self.options, self.batches, extent = inputs(args, ranks.device)
         self.ranks, self.total, config = ranks, len(table), Config()
         rows = torch.arange(ranks.rank, self.total, ranks.world_size, device=table.device)
-        if args.order == "morton":
-            rows = rows[morton_order(table["means"][rows])]
+        rows = rows[morton_order(table["means"][rows])]
         self.table = GaussianTable({name: table[name][rows].to(ranks.device) for name in table})
         self.owners, self.guard, self.steps = TileOwners(ranks), LossGuard(), 0
         self.loss = config.loss
@@ -197,7 +196,6 @@ def measure(args: argparse.Namespace) -> None:
             "ranks": ranks.world_size,
             "device": torch.cuda.get_device_name() if ranks.device.type == "cuda" else "cpu",
             "gaussians": load.total,
-            "order": args.order,
             "visible per step": visible,
             "splats per step": splats,
             "splats sent to other ranks": sent,
@@ -225,12 +223,6 @@ def main() -> None:
     parser.add_argument("--batch", type=int, nargs="+", default=[4], help="views per step (%(default)s)")
     parser.add_argument("--batches", type=int, default=6, help="different batches (%(default)s)")
     parser.add_argument("--visits", type=int, default=3, help="timed visits of every batch (%(default)s)")
-    parser.add_argument(
-        "--order",
-        choices=("morton", "random"),
-        default="morton",
-        help="of the rows in memory; the trainer's is morton (%(default)s)",
-    )
     parser.add_argument("--ranks", type=int, nargs="+", default=[1, 2, 4])
     args = parser.parse_args()
     if "WORLD_SIZE" in os.environ:

@@ -26,7 +26,6 @@ from torch import Tensor
 from blitzgs import rasterization
 from blitzgs.frame.render import RenderOptions, backward_splats, inputs_of, render_frame, stage_ended
 from blitzgs.frame.transport.protocol import LocalTransport, stages_told_to
-from blitzgs.ops.projection_types import Views
 from blitzgs.table.table import GaussianTable
 
 try:
@@ -58,7 +57,7 @@ class OurRender:
 
     def __init__(self, scene: BenchmarkScene) -> None:
         self.table = GaussianTable.create(scene.raw())
-        self.views = Views(scene.viewmats, scene.Ks, scene.width, scene.height)
+        self.views = scene.views
         self.transport = LocalTransport()
 
     def forward(self) -> Tensor:
