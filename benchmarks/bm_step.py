@@ -19,6 +19,7 @@ from typing import Any
 import torch
 from bm_render import OPTIONS, CallRender
 from harness import make_parser, stage_medians, write_json
+from report_tables import step_lines
 from scenes import BenchmarkScene, aerial, garden_like
 
 from blitzgs.config.fields import LossConfig, OptimiserConfig, ScheduleConfig
@@ -152,7 +153,7 @@ def measure(step: OurStep | GsplatStep, repeats: int) -> list[tuple[str, float]]
 
 
 def run(name: str, views: int, repeats: int) -> dict[str, Any]:
-    """Measure both steps on one scene; prints as it goes."""
+    """Measure both steps on one scene."""
     result: dict[str, Any] = {"views": views}
     for label, kind in (("blitzgs", OurStep), ("gsplat + fused Adam", GsplatStep)):
         torch.cuda.empty_cache()
@@ -164,21 +165,14 @@ def run(name: str, views: int, repeats: int) -> dict[str, Any]:
         except ImportError:
             continue
         times = measure(step, repeats)
-        peak = torch.cuda.max_memory_allocated() / 1e9
         # Stages of one name, at both ends of a step, count together.
         stages: dict[str, float] = {}
         for stage, ms in times:
             stages[stage] = stages.get(stage, 0.0) + ms
-        result[label] = {"ms": stages, "peak_gb": peak}
-        visible = f", {step.visible} visible" if isinstance(step, OurStep) else ""
-        print(f"{scene.name}, {views} view(s){visible}: {label}")
-        print(f"  {', '.join(f'{stage} {ms:.3f}' for stage, ms in times)} ms  peak {peak:.2f} GB")
+        result[label] = {"ms": stages, "peak_gb": torch.cuda.max_memory_allocated() / 1e9}
         if isinstance(step, OurStep):
             result["visible"] = step.visible
         del step, scene
-    if "gsplat + fused Adam" in result:
-        ratio = result["gsplat + fused Adam"]["ms"]["total"] / result["blitzgs"]["ms"]["total"]
-        print(f"  ratio {ratio:.2f}", flush=True)
     return result
 
 
@@ -189,7 +183,10 @@ def main() -> None:
     )
     parser.add_argument("--views", type=int, default=1, help="views in a batch")
     args = parser.parse_args()
-    results = [run(name, args.views, args.repeats) for name in args.scenes]
+    results = []
+    for name in args.scenes:
+        results.append(run(name, args.views, args.repeats))
+        print("\n".join(step_lines({"results": results[-1:]})) + "\n", flush=True)
     write_json(args.json, "cuda", results=results)
 
 
