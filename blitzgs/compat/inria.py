@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.call.covariances import Decomposed, decompose, shaped_by
-from blitzgs.call.gaussians import l1_ssim
+from blitzgs.call.losses import l1_ssim
 from blitzgs.ops.derivatives import first_only, linear_map
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.knn_distances import knn_distances
