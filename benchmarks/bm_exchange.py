@@ -75,7 +75,7 @@ def capture_inputs(args: argparse.Namespace, device: torch.device) -> Inputs:
         points, torch.from_numpy(capture.colors).to(device), centres,
         measure_levels(points, centres, FORK), args.visible_threshold,
     ).table(sh_degree=3, opacity=0.5)  # fmt: skip
-    views = ViewSet(list(capture.cameras), space, device)
+    views = ViewSet(capture.cameras, space, device)
     count = min(args.batch * args.batches, len(capture.train))
     chosen = [capture.train[k * len(capture.train) // count] for k in range(count)]
     groups = [chosen[i : i + args.batch] for i in range(0, len(chosen), args.batch)]

@@ -74,7 +74,7 @@ class Survey:
     def __init__(self, scene: BenchmarkScene, device: torch.device) -> None:
         cameras = survey(scene)
         self.ranks = Ranks(device=device)
-        self.views = ViewSet(list(cameras), Space((0.0, 0.0, 0.0), 1.0, 1.0), device)
+        self.views = ViewSet(cameras, Space((0.0, 0.0, 0.0), 1.0, 1.0), device)
         points = scene.means[:: max(1, len(scene.means) // 100_000)].double().cpu().numpy()
         sizes, tour = [0] * len(cameras), tour_of(cameras, points)
         self.orders = {

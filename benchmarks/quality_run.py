@@ -184,7 +184,7 @@ def train_partition(spec: RunSpec, ranks: Ranks) -> dict[str, Any]:
     split_seconds = time.monotonic() - begin
     merged = spatial_partition.train(config, capture, images, ranks, grid, blocks)
     space = Space.of(capture.offset, capture.extent)
-    views = ViewSet(list(capture.cameras), space, ranks.device)
+    views = ViewSet(capture.cameras, space, ranks.device)
     lpips, owners = load_lpips(spec.lpips), TileOwners(ranks)
 
     def measure_now(indices: Sequence[int]) -> dict[str, Any]:

@@ -107,7 +107,6 @@ class Layout:
         packed: bool,
         under: Tensor | None,  # opacities of Gaussians without a splat, [..., N]; None: zero
     ) -> None:
-        """Compute the arrangement."""
         self.splats, self.packed = splats, packed
         self.places: Places | None = None  # of each splat in `meta`; None: the order is unchanged
         if not packed:

@@ -83,7 +83,6 @@ class TileAssignment:
     """The division of tiles among the ranks in one rendering; all ranks of the job render together."""
 
     def __init__(self, ranks: Ranks, ranges: TileRanges) -> None:
-        """Compute which tiles each rank composites."""
         self.ranks, self.ranges = ranks, ranges
         self.own_tiles = ranges.of(ranks.rank)  # [first, one past last)
         # What a rank composites: its own tiles and the halo around them, [first, one past last).

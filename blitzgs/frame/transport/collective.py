@@ -30,7 +30,6 @@ class CollectiveTransport:
     """
 
     def __init__(self, ranks: Ranks) -> None:
-        """Send splats between `ranks`."""
         self.estimate = CapacityEstimate()
         self._ranks = ranks
 

@@ -88,8 +88,7 @@ class PeerBuffers:
     """The parts of the buffers of all ranks."""
 
     def __init__(self, buffers: Sequence[Tensor], rank: int) -> None:
-        """Divide buffers of equal length."""
-        self.buffers = list(buffers)  # int32 [words] of each rank, mapped here
+        self.buffers = list(buffers)  # int32 [words] of each rank, of equal length, mapped here
         # Capacity of each buffer, in splats.
         self.length = len(buffers[0]) // WORDS_PER_SPLAT // _ALIGNMENT * _ALIGNMENT
         columns, begin = [], 0
