@@ -186,7 +186,7 @@ def lists_of(
         if pixels is not None:
             return _lists_of_pixels(splats, grid, pixels)
         own = (splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids)
-        entries, offsets = torch.ops.blitzgs.intersect(*own, None, *grid, n_isects, None, True)
+        entries, offsets = torch.ops.blitzgs.intersect(*own, None, *grid, n_isects, unchecked=True)
         return Lists(entries, offsets, grid)
 
     lists = listed_by(projection.tile_size, count)
@@ -203,7 +203,7 @@ def _lists_of_pixels(splats: ProjectedSplats, grid: TileGrid, pixels: Pixels) ->
     near = _splats_near(splats, wanted, edge)
     own = (splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids)
     chosen = [column.detach().index_select(0, near) for column in own]
-    listed, offsets = torch.ops.blitzgs.intersect(*chosen, None, *grid, -1, None, True)
+    listed, offsets = torch.ops.blitzgs.intersect(*chosen, None, *grid, -1, unchecked=True)
     lengths, count = offsets.diff(), int(offsets[-1])
     kept = wanted.view(-1).repeat_interleave(lengths, output_size=count)
     ends = (lengths * wanted.view(-1)).cumsum(0)

@@ -93,7 +93,16 @@ def raw_rasterization(
     if further:
         check_further("raw_rasterization", further, _defaults())
     projection = checked_options(
-        width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size, rasterize_mode, True
+        width,
+        height,
+        near_plane,
+        far_plane,
+        radius_clip,
+        eps2d,
+        sh_degree,
+        tile_size,
+        rasterize_mode,
+        raw=True,
     )
     check_choice("render_mode", render_mode, RENDER_MODES)
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh0": sh0}
@@ -115,7 +124,8 @@ def raw_rasterization(
     sh_degree = _checked_degree(harmonics, len(means), sh_degree, shaded)
     projection = projection._replace(sh_degree=sh_degree)
     scene = Scene(means, quats, scales, opacities, None, viewmats, Ks)
-    whole = gaussians_of("raw_rasterization", scene, None, "D", raw=True)
+    # The SH are not part of the scene: only their visible rows are read.
+    whole = gaussians_of("raw_rasterization", scene, sh_degree=None, render_mode="D", raw=True)
     if sparse_grad and torch.is_grad_enabled():
         _check_leaves(params | sh_params if shaded else params)
     given = {**tensors, "viewmats": viewmats, "Ks": Ks, "shN": shN}
@@ -125,7 +135,7 @@ def raw_rasterization(
     colors, degree = (sh0, sh_degree) if shaded else (None, None)
     gaussians = whole._replace(colors=colors, sh_degree=degree, named=named)
     background = background_rows(backgrounds, gaussians, render_mode)
-    image = ImageOptions(render_mode, background, True, sparse_grad, absgrad)
+    image = ImageOptions(render_mode, background, packed=True, sparse_grad=sparse_grad, absgrad=absgrad)
 
     def catch_up_sh(rows: Tensor, count: Tensor | None) -> None:
         for optimizer in lazy:

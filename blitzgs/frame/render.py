@@ -87,6 +87,11 @@ class Frame(NamedTuple):
     saved: RasterizeSaved  # the tensors that the backward pass of compositing reads
     gradients: GradientBuffer  # memory in which the gradients of the splats are summed
 
+    @property
+    def own_tiles(self) -> tuple[int, int]:
+        """The tiles whose loss this rank computes, [first, one past last); -1: all from the first on."""
+        return (0, -1) if self.assignment is None else self.assignment.own_tiles
+
     def over_own_background(self) -> Tensor:
         """Return the renders over the background of the options, if views had others, [B, H, W, 3]."""
         given = self.saved.backgrounds
@@ -201,7 +206,7 @@ def tile_lists(exchange: Exchange, grid: TileGrid) -> list[Tensor]:
     splats = exchange.arrived
     lists = torch.ops.blitzgs.intersect(
         splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, splats.ids,
-        *grid, exchange.n_isects, exchange.n_splats, True,
+        *grid, exchange.n_isects, exchange.n_splats, unchecked=True,
     )  # fmt: skip
     return list(lists)
 
@@ -225,8 +230,7 @@ def backward_splats(frame: Frame, v_renders: Tensor) -> SplatGradients:
     RuntimeError: the ranks share memory, and a later frame has overwritten this frame's splats.
     """
     views, options, way_back = frame.views, frame.options, frame.way_back
-    tiles = (0, -1) if frame.assignment is None else frame.assignment.own_tiles
-    grid = TileGrid(len(views), views.width, views.height, TILE_SIZE, *tiles)
+    grid = TileGrid(len(views), views.width, views.height, TILE_SIZE, *frame.own_tiles)
     if way_back is not None:
         way_back.check_still_valid()
     table = frame.gradients.take(frame.splats.means2d) if v_renders.is_cuda else None

@@ -71,7 +71,7 @@ def loss_terms(
         batch.masks,
         *_weights(config.ssim, count, batch.samples.device),
         TILE_SIZE,
-        *((0, -1) if assignment is None else assignment.own_tiles),
+        *frame.own_tiles,
         samples=batch.samples,
         visible=frame.visible,
         scale_weight=config.scale / (extent * SCALE_UNIT * count),
