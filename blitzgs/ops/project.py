@@ -18,6 +18,7 @@ from blitzgs.ops.projection_types import (
     ProjectedSplats,
     ProjectionInputs,
     ProjectionOptions,
+    ProjectionOutputs,
     Sizes,
     splats_of,
 )
@@ -197,10 +198,27 @@ def project(
     return differentiable_splats(inputs, sparse_grad)
 
 
+def queue_projection(
+    inputs: ProjectionInputs, capacity: Sizes | None, rank_tiles: Sequence[tuple[int, int]] = ()
+) -> ProjectionOutputs:
+    """Project as `project` does, with grouped arguments, without gradients.
+
+    `capacity`: numbers of visible Gaussians and splats to allocate; CUDA then does not wait for the true
+    numbers. None: wait, and allocate exactly as many as there are. `rank_tiles`: for each rank the [begin,
+    end) of the tiles that it composites, in ascending order.
+    """
+    room = (None, None) if capacity is None else capacity[:2]
+    *columns, splat_ids, totals = torch.ops.blitzgs.project_fwd(
+        inputs.gaussians, *inputs.cameras, *inputs.active_arguments, inputs.ids, inputs.level,
+        *inputs.options, [tile for tiles in rank_tiles for tile in tiles], *room,
+    )  # fmt: skip
+    return ProjectionOutputs(ProjectedSplats._make((*columns, None)), splat_ids, totals)
+
+
 def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
-    """Project as `project` does, with grouped arguments, without gradients. Wait for the number of splats."""
+    """Project as `queue_projection` does, and wait for the number of splats."""
     with below_autograd():
-        projected = inputs.project(None)
+        projected = queue_projection(inputs, None)
         return splats_of(projected.splats, Sizes(*to_host(projected.totals)[:3].tolist()))
 
 

@@ -10,7 +10,7 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.render import render_frame
-from blitzgs.ops.project import differentiable_splats, project
+from blitzgs.ops.project import differentiable_splats, project, queue_projection
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Views
 from blitzgs.reference.render import render as reference_render
 from blitzgs.view.gate import LodGate, ModelGate, centres_of
@@ -248,7 +248,7 @@ def test_errors_name_the_value():
 
     def call(level, fade):
         options = ProjectionOptions(WIDTH, HEIGHT, fade=fade)
-        ProjectionInputs(table.parameters, (viewmats, Ks), options, level=level).project(None)
+        queue_projection(ProjectionInputs(table.parameters, (viewmats, Ks), options, level=level), None)
 
     refused(RuntimeError, "project_fwd: levels need a fade_slope of at least 1", call, table["level"], ())
     refused(RuntimeError, r"level must have shape \[10\], got \[9\]", call, table["level"][1:], SMOOTH.fade())

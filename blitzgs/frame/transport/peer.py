@@ -58,6 +58,7 @@ from blitzgs.frame.transport.protocol import (
 )
 from blitzgs.ops.exchange import PLACE_SPLATS
 from blitzgs.ops.host import current_stream
+from blitzgs.ops.project import queue_projection
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats, splats_of
 from blitzgs.ops.rasterize import SPLAT_GRADIENT, SplatGradients
 
@@ -135,7 +136,7 @@ class PeerTransport:
             self._buffers = PeerBuffers(memory.buffers, ranks.rank)
         buffers = self._buffers
         room = Sizes(buffers.length, buffers.length, 0)
-        projected = inputs.project(room, assignment.composited_by_rank)
+        projected = queue_projection(inputs, room, assignment.composited_by_rank)
         shared = memory.share(projected.totals)  # barrier A
         counted.record(current_stream(ranks.device))
         places, plan = torch.ops.blitzgs.send_splats_(
