@@ -34,7 +34,7 @@ import torch
 from bm_quality import Pool, work
 from city_report import TABLES
 from city_run import RESERVE, CityRun
-from harness import ROOT, command_line, make_parser, markdown_table, positive, write_json
+from harness import ROOT, make_parser, markdown_table, positive, write_json
 from quality_plan import parse_named, runs_of
 
 CONFIG = ROOT / "configs" / "city.yaml"
@@ -125,12 +125,7 @@ def collect(args: Any) -> str:
     file = {"city": json.loads(saved.read_text()), "results": runs}
     if not runs:
         return "no run has any results yet"
-    known = [run for run in runs if "environment" in run]  # those that got as far as their training
-    about = {
-        "command": command_line(),
-        "commit": " and ".join(sorted({run["commit"] for run in runs})),
-        "environment": known[0]["environment"] if known else {},
-    }
+    about = quality_report.origin_of(runs)
     write_json(args.json, "cpu", **about, **file)
     lines = [f"# The city\n\n`{about['command']}`, commit {about['commit']}"]
     for name, rows_of in TABLES.items():

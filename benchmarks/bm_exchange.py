@@ -43,7 +43,7 @@ from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TILE_COST, TileOwners
 from blitzgs.frame.render import RenderOptions
-from blitzgs.frame.tiles import LOSS_HALO, TileRanges
+from blitzgs.frame.tiles import LOSS_HALO
 from blitzgs.frame.transport.protocol import stages_told_to
 from blitzgs.ops.projection_types import Views
 from blitzgs.optim.table_adam import TableAdam
@@ -114,16 +114,12 @@ class Workload:
         self.targets = torch.full(shape, 128, dtype=torch.uint8, device=ranks.device)
         self.samples = torch.full((len(views),), 3.0 * views.height * views.width, device=ranks.device)
 
-    def divide(self, keys: list[int], views: Views) -> TileRanges | None:
-        """Divide the tiles of a batch as the trainer does."""
-        if self.ranks.world_size == 1:
-            return None
-        return self.owners.divide(keys, views.width, views.height, LOSS_HALO)
-
     def batch(self, keys: list[int], views: Views) -> Batch:
-        """Return views with grey photographs."""
-        samples, targets = self.samples[: len(keys)], self.targets[: len(keys)]
-        return Batch(keys, views, targets, None, samples, self.divide(keys, views))
+        """Return views with grey photographs, their tiles divided as the trainer does."""
+        samples, targets, ranges = self.samples[: len(keys)], self.targets[: len(keys)], None
+        if self.ranks.world_size > 1:
+            ranges = self.owners.divide(keys, views.width, views.height, LOSS_HALO)
+        return Batch(keys, views, targets, None, samples, ranges)
 
     def step(self, batch: Batch) -> dict[str, Any]:
         """Take one training step."""
