@@ -39,7 +39,7 @@ from blitzgs.frame.render import Frame, RenderOptions, render_frame
 from blitzgs.frame.tiles import TileAssignment, TileRanges
 from blitzgs.frame.transport.collective import CollectiveTransport
 from blitzgs.frame.transport.protocol import LocalTransport, Transport
-from blitzgs.ops.intersect import tile_counts
+from blitzgs.ops.intersect import TILE_SIZE, tile_counts
 from blitzgs.ops.projection_types import Views
 from blitzgs.reference import Composite, Splats, composite, project_splats
 from blitzgs.table.table import PARAMETERS, GaussianTable
@@ -47,7 +47,7 @@ from tests.helpers import parameter_gradients
 
 IMAGE_BOUND, GRADIENT_BOUND = 2e-5, 1e-4  # largest errors of the default setting
 
-NEAR, FAR, EPS2D, TILE = 0.01, 1e10, 0.3, 16
+NEAR, FAR, EPS2D = 0.01, 1e10, 0.3
 
 
 class ExactWindows:
@@ -186,9 +186,9 @@ class Renderer:
         self.assignment: TileAssignment | None = None
         self.transport: Transport = LocalTransport()
         if option.exchanged:
-            columns, lines = tile_counts(scene.width, scene.height, TILE)
+            columns, lines = tile_counts(scene.width, scene.height, TILE_SIZE)
             bounds = (0, len(Ks) * columns * lines)
-            ranges = TileRanges(bounds, len(Ks), scene.width, scene.height, TILE)
+            ranges = TileRanges(bounds, len(Ks), scene.width, scene.height)
             ranks = Ranks(device=device)
             self.assignment = TileAssignment(ranks, ranges)
             self.transport = CollectiveTransport(ranks)

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Trains a synthetic city with and without the view level: quality, speed by phase, memory, popping, ranks.
 
-    blitzgs synth CITY --preset city | tee generation.txt
-    python benchmarks/bm_city.py CITY --out RESULTS --generation-log generation.txt --scale 0.6 \
-        --gpus 2 --ranks 1 2 --popping --json benchmarks/results/city.json
+    blitzgs synth CITY --preset city
+    python benchmarks/bm_city.py CITY --out RESULTS --scale 0.6 --gpus 2 --ranks 1 2 --popping \
+        --json benchmarks/results/city.json
 
 The arms are `configs/city.yaml` with the LOD gate and the cull mask (full), without the one (no_lod), the
 other (no_mask), or both (all_off), and those of --arm NAME="--section.field=value ...". Every run is a
-process on one GPU; each GPU has one at a time. The
-numbers of ranks above 1 follow when these are over: the first of --arms, under torchrun, with the machine to
-itself. With several --batch-sizes, the first of --arms is trained with each on every number of ranks.
+process on one GPU; each GPU has one at a time. The numbers of ranks above 1 follow when these are over: the
+first of --arms, under torchrun, with the machine to itself. With several --batch-sizes, the first of --arms
+is trained with each on every number of ranks.
 
 A run writes its figures into RESULTS/runs after its set-up, training, evaluation and popping. Some seconds
 before --seconds-per-run are over, its training stops where it is and is evaluated there ("finished": false).
@@ -24,7 +24,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
-import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,7 +34,7 @@ import torch
 from bm_quality import Pool, work
 from city_report import TABLES
 from city_run import RESERVE, CityRun
-from harness import ROOT, command_line, make_parser, markdown_table, positive, write_json
+from harness import ROOT, make_parser, markdown_table, positive, write_json
 from quality_plan import parse_named, runs_of
 
 CONFIG = ROOT / "configs" / "city.yaml"
@@ -105,8 +104,8 @@ def plan(args: Any, overrides: Sequence[str]) -> list[CityRun]:
     return runs
 
 
-def about_city(city: Path, log: Path | None) -> Json:
-    """Return what `blitzgs synth` noted about the city, its images and bytes, and the seconds it took."""
+def about_city(city: Path) -> Json:
+    """Return what `blitzgs synth` noted about the city, and number and bytes of its images."""
     manifest = city / "city.json"
     if not manifest.exists():
         raise ValueError(
@@ -114,10 +113,7 @@ def about_city(city: Path, log: Path | None) -> Json:
         )
     sizes = [file.stat().st_size for file in (city / "images").iterdir()]
     found: Json = json.loads(manifest.read_text())
-    found |= {"images": len(sizes), "image_bytes": sum(sizes)}
-    if log is not None and (seconds := re.findall(r", ([\d.]+) s$", log.read_text(), re.MULTILINE)):
-        found["seconds"] = float(seconds[-1])
-    return found
+    return found | {"images": len(sizes), "image_bytes": sum(sizes)}
 
 
 def collect(args: Any) -> str:
@@ -129,12 +125,7 @@ def collect(args: Any) -> str:
     file = {"city": json.loads(saved.read_text()), "results": runs}
     if not runs:
         return "no run has any results yet"
-    known = [run for run in runs if "environment" in run]  # those that got as far as their training
-    about = {
-        "command": command_line(),
-        "commit": " and ".join(sorted({run["commit"] for run in runs})),
-        "environment": known[0]["environment"] if known else {},
-    }
+    about = quality_report.origin_of(runs)
     write_json(args.json, "cpu", **about, **file)
     lines = [f"# The city\n\n`{about['command']}`, commit {about['commit']}"]
     for name, rows_of in TABLES.items():
@@ -171,7 +162,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seconds-per-run", type=float, default=100.0, help="(%(default)s)")
     parser.add_argument("--held-out", type=positive, default=64, help="views to measure (%(default)s)")
     parser.add_argument("--scale", type=float, default=0.9, help="of the schedule (%(default)s)")
-    parser.add_argument("--generation-log", type=Path, help="what blitzgs synth printed, for its seconds")
     parser.add_argument("--collect", action="store_true", help="train nothing; write tables and JSON")
     args, overrides = parser.parse_known_args(arguments)
     try:
@@ -182,7 +172,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise ValueError(f"--seconds-per-run must be above {RESERVE:g}, got {args.seconds_per_run:g}")
         if args.gpus and max(args.ranks) > args.gpus:
             raise ValueError(f"--ranks {max(args.ranks)} needs as many --gpus, got {args.gpus}")
-        about = about_city(args.city, args.generation_log)
+        about = about_city(args.city)
         (args.out / quality_report.RUNS).mkdir(parents=True, exist_ok=True)
         (args.out / "city.json").write_text(json.dumps(about))
         runs = plan(args, overrides)

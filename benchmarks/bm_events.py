@@ -5,33 +5,32 @@
     torchrun --nproc-per-node=4 benchmarks/bm_events.py [--millions 12]
 
 The table is the `aerial` scene of `scenes.py`, dealt round-robin to the ranks, each row some steps behind.
-Before every event, `--dead` of the Gaussians become transparent; an event replaces them, and the table grows
-by 5 % in each of the first `--events` and not in as many after them. Times are medians and means, in ms by
+Before every event, one percent of the Gaussians become transparent; an event replaces them, and the table
+grows by 5 % in each of the first five and not in as many after them. Times are medians and means, in ms by
 the host's clock with the device idle before and after, of the slowest rank. "event" is an event as in a
-training. With one rank, steps of `--views` views are measured before the events, after them, and
-once the table is sorted again.
+training. With one rank, steps of four views are measured before the events, after them, and once the table is
+sorted again.
 """
 
 from __future__ import annotations
 
-import argparse
 import statistics
 from collections import defaultdict
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import torch
-from bm_step import BEHIND, LOSS, OPTIONS, RATE, STEP, make_table, random_photographs
+from bm_step import LOSS, STEP, make_optimiser, make_table, put_behind, random_photographs, take_step
 from harness import make_parser, seconds_of, write_json
 from scenes import BenchmarkScene, aerial
 
-from blitzgs.config.fields import Config, OptimiserConfig
+from blitzgs.config.fields import Config
 from blitzgs.config.schedule import Event, Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs.log import RunLog
 from blitzgs.runs.trained_model import Progress
 from blitzgs.table.blocks import morton_order, sort_rows
@@ -39,6 +38,10 @@ from blitzgs.table.table import GaussianTable
 from blitzgs.training.events import densify
 from blitzgs.training.state import TrainingState
 from blitzgs.training.step import Stepper
+
+VIEWS = 4  # of a step
+EVENTS = 5  # timed events of each kind
+DEAD = 0.01  # share that dies before an event
 
 
 def rows_of(scene: BenchmarkScene, ranks: Ranks) -> torch.Tensor:
@@ -58,7 +61,7 @@ def make_state(scene: BenchmarkScene, table: GaussianTable, ranks: Ranks) -> Tra
         ),
     )  # fmt: skip
     schedule = Schedule(config.schedule)
-    optimiser = TableAdam(OptimiserConfig(*[RATE] * 5), schedule, 1.0, ranks.device)
+    optimiser = make_optimiser(schedule, ranks.device)
     owners = TileOwners(ranks)
     capture = SimpleNamespace(cameras=[], train=[], points=[])
     progress = Progress(step=STEP, sh_degree=3, level_count=1, peak_gaussians=0, seconds=0.0)
@@ -89,9 +92,9 @@ def make_state(scene: BenchmarkScene, table: GaussianTable, ranks: Ranks) -> Tra
 class Events:
     """Runs events on the table of a state, and steps between them."""
 
-    def __init__(self, state: TrainingState, scene: BenchmarkScene, dead: float) -> None:
-        self.state, self._dead, self._time = state, dead, 0
-        self._batch = random_photographs(scene) if state.ranks.world_size == 1 else None
+    def __init__(self, state: TrainingState, scene: BenchmarkScene) -> None:
+        self.state, self._time = state, 0
+        self._batch = random_photographs(scene.views) if state.ranks.world_size == 1 else None
         self.sorts = 0
         densify.sort_rows = self._sort
 
@@ -99,21 +102,14 @@ class Events:
         self.sorts += 1
         sort_rows(table)
 
-    def prepare(self) -> None:
-        """Put every row some steps behind."""
-        table = self.state.table
-        for name in ("last_step", "moment_step"):
-            table[name].copy_(STEP - (table["id"] % BEHIND).int())
-        self.state.stepper.reindex()
-
     def prepare_event(self) -> None:
         """Put every row some steps behind, and make some transparent."""
         table = self.state.table
         self._time += 1
         generator = torch.Generator(table.device).manual_seed(self._time * 1000 + self.state.ranks.rank)
-        chosen = torch.rand(len(table), generator=generator, device=table.device) < self._dead
+        chosen = torch.rand(len(table), generator=generator, device=table.device) < DEAD
         table["opacities"].masked_fill_(chosen, -9.0)
-        self.prepare()
+        put_behind(self.state.stepper, STEP + 1)
 
     def event(self) -> None:
         """Run an event."""
@@ -123,16 +119,12 @@ class Events:
         """Return the median ms of a step; None with several ranks."""
         if self._batch is None:
             return None
-        seconds = []
+        stepper, seconds = self.state.stepper, []
+        take = partial(take_step, stepper, STEP + 1, self._batch)
         for _ in range(repeats):
-            self.prepare()
-            seconds.append(seconds_of(self.state.ranks.device, self._step))
+            put_behind(stepper, STEP + 1)
+            seconds.append(seconds_of(self.state.ranks.device, take))
         return 1e3 * statistics.median(seconds[2:])
-
-    def _step(self) -> None:
-        assert self._batch is not None
-        frame, terms, _ = self.state.stepper.forward(STEP + 1, OPTIONS, self._batch)
-        self.state.stepper.backward(STEP + 1, frame, terms)
 
 
 def slowest(ranks: Ranks, values: dict[str, float]) -> dict[str, float]:
@@ -141,15 +133,15 @@ def slowest(ranks: Ranks, values: dict[str, float]) -> dict[str, float]:
     return {name: max(other.get(name, 0.0) for other in everywhere) for name in values}
 
 
-def measure(millions: float, ranks: Ranks, args: argparse.Namespace) -> dict[str, Any]:
+def measure(millions: float, ranks: Ranks) -> dict[str, Any]:
     """Measure the events of one size, as a whole."""
     if ranks.device.type == "cuda":
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
-    scene = aerial(int(millions * 1e6), str(ranks.device), views=args.views)
+    scene = aerial(int(millions * 1e6), str(ranks.device), views=VIEWS)
     table = make_table(scene, rows_of(scene, ranks))
     state = make_state(scene, table, ranks)
-    events = Events(state, scene, args.dead)
+    events = Events(state, scene)
     result: dict[str, Any] = {"millions": millions, "ranks": ranks.world_size}
     table_gb = sum(table.row_bytes.values()) * len(table) / 1e9
     events.prepare_event()
@@ -158,7 +150,7 @@ def measure(millions: float, ranks: Ranks, args: argparse.Namespace) -> dict[str
     measured: dict[str, list[float]] = defaultdict(list)
     for growth in (0.05, 0.0):
         state.config = replace(state.config, population=replace(state.config.population, growth=growth))
-        for _ in range(args.events):
+        for _ in range(EVENTS):
             events.prepare_event()
             ranks.barrier()
             measured[f"event, growth {growth:g}"].append(seconds_of(ranks.device, events.event))
@@ -184,12 +176,9 @@ def main() -> None:
     parser.add_argument(
         "--millions", type=float, nargs="+", default=[1, 4, 12], help="Gaussians (%(default)s)"
     )
-    parser.add_argument("--events", type=int, default=5, help="timed events of each kind (%(default)s)")
-    parser.add_argument("--views", type=int, default=4, help="views of a step (%(default)s)")
-    parser.add_argument("--dead", type=float, default=0.01, help="share that dies at an event (%(default)s)")
     args = parser.parse_args()
     ranks = Ranks.from_environment(args.device)
-    results = [measure(millions, ranks, args) for millions in args.millions]
+    results = [measure(millions, ranks) for millions in args.millions]
     if ranks.rank == 0:
         for result in results:
             shown = ", ".join(

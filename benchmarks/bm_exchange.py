@@ -43,7 +43,7 @@ from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TILE_COST, TileOwners
 from blitzgs.frame.render import RenderOptions
-from blitzgs.frame.tiles import LOSS_HALO, TileRanges
+from blitzgs.frame.tiles import LOSS_HALO
 from blitzgs.frame.transport.protocol import stages_told_to
 from blitzgs.ops.projection_types import Views
 from blitzgs.optim.table_adam import TableAdam
@@ -75,7 +75,7 @@ def capture_inputs(args: argparse.Namespace, device: torch.device) -> Inputs:
         points, torch.from_numpy(capture.colors).to(device), centres,
         measure_levels(points, centres, FORK), args.visible_threshold,
     ).table(sh_degree=3, opacity=0.5)  # fmt: skip
-    views = ViewSet(list(capture.cameras), space, device)
+    views = ViewSet(capture.cameras, space, device)
     count = min(args.batch * args.batches, len(capture.train))
     chosen = [capture.train[k * len(capture.train) // count] for k in range(count)]
     groups = [chosen[i : i + args.batch] for i in range(0, len(chosen), args.batch)]
@@ -103,8 +103,7 @@ class Workload:
         table, self.options, self.batches, extent = inputs(args, ranks.device)
         self.ranks, self.total, config = ranks, len(table), Config()
         rows = torch.arange(ranks.rank, self.total, ranks.world_size, device=table.device)
-        if args.order == "morton":
-            rows = rows[morton_order(table["means"][rows])]
+        rows = rows[morton_order(table["means"][rows])]
         self.table = GaussianTable({name: table[name][rows].to(ranks.device) for name in table})
         self.owners, self.guard, self.steps = TileOwners(ranks), LossGuard(), 0
         self.loss = config.loss
@@ -115,16 +114,12 @@ class Workload:
         self.targets = torch.full(shape, 128, dtype=torch.uint8, device=ranks.device)
         self.samples = torch.full((len(views),), 3.0 * views.height * views.width, device=ranks.device)
 
-    def divide(self, keys: list[int], views: Views) -> TileRanges | None:
-        """Divide the tiles of a batch as the trainer does."""
-        if self.ranks.world_size == 1:
-            return None
-        return self.owners.divide(keys, views.width, views.height, self.options.tile_size, LOSS_HALO)
-
     def batch(self, keys: list[int], views: Views) -> Batch:
-        """Return views with grey photographs."""
-        samples, targets = self.samples[: len(keys)], self.targets[: len(keys)]
-        return Batch(keys, views, targets, None, samples, self.divide(keys, views))
+        """Return views with grey photographs, their tiles divided as the trainer does."""
+        samples, targets, ranges = self.samples[: len(keys)], self.targets[: len(keys)], None
+        if self.ranks.world_size > 1:
+            ranges = self.owners.divide(keys, views.width, views.height, LOSS_HALO)
+        return Batch(keys, views, targets, None, samples, ranges)
 
     def step(self, batch: Batch) -> dict[str, Any]:
         """Take one training step."""
@@ -197,7 +192,6 @@ def measure(args: argparse.Namespace) -> None:
             "ranks": ranks.world_size,
             "device": torch.cuda.get_device_name() if ranks.device.type == "cuda" else "cpu",
             "gaussians": load.total,
-            "order": args.order,
             "visible per step": visible,
             "splats per step": splats,
             "splats sent to other ranks": sent,
@@ -225,12 +219,6 @@ def main() -> None:
     parser.add_argument("--batch", type=int, nargs="+", default=[4], help="views per step (%(default)s)")
     parser.add_argument("--batches", type=int, default=6, help="different batches (%(default)s)")
     parser.add_argument("--visits", type=int, default=3, help="timed visits of every batch (%(default)s)")
-    parser.add_argument(
-        "--order",
-        choices=("morton", "random"),
-        default="morton",
-        help="of the rows in memory; the trainer's is morton (%(default)s)",
-    )
     parser.add_argument("--ranks", type=int, nargs="+", default=[1, 2, 4])
     args = parser.parse_args()
     if "WORLD_SIZE" in os.environ:

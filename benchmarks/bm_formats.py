@@ -34,6 +34,7 @@ from tests.helpers import read_glb
 
 
 def read(path: Path) -> Gaussians:
+    """Read a model file, also GLB, which has activated scales and opacities."""
     if path.suffix != ".glb":
         return read_gaussians(path)
     content, found = read_glb(path)

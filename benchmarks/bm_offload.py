@@ -18,27 +18,26 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
-from bm_step import LOSS, OPTIONS, RATE, make_table
+from bm_step import LOSS, make_optimiser, make_table, random_photographs, take_step
 from harness import make_parser, seconds_of, write_json
 from report_tables import offload_lines
 from scenes import BenchmarkScene, aerial, look_at
 
-from blitzgs.config.fields import OptimiserConfig, ScheduleConfig
+from blitzgs.config.fields import ScheduleConfig
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.optim.table_adam import TableAdam
 from blitzgs.runs.cameras import RunCamera
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.host_table import HostTable
 from blitzgs.table.pool import Pool, PoolError
 from blitzgs.table.table import GaussianTable
-from blitzgs.training.batches import Batch
 from blitzgs.training.offload import OffloadingStepper, UpcomingCameras
 from blitzgs.training.sampler import BatchSampler, tour_of
 from blitzgs.training.step import Stepper
@@ -65,41 +64,35 @@ class FlightOrder(BatchSampler):
     """Chooses views in the order of the flight."""
 
     def batch(self, step: int) -> list[int]:
-        """Return consecutive views."""
-        return [(step * self.batch_size + view) % (LINES * VIEWS_A_LINE) for view in range(self.batch_size)]
+        """Return the next view."""
+        return [step % (LINES * VIEWS_A_LINE)]
 
 
 class Survey:
     """The parts that the steps of all arms use."""
 
-    def __init__(self, scene: BenchmarkScene, batch_size: int, device: torch.device) -> None:
+    def __init__(self, scene: BenchmarkScene, device: torch.device) -> None:
         cameras = survey(scene)
-        self.ranks, self.batch_size = Ranks(device=device), batch_size
-        self.views = ViewSet(list(cameras), Space((0.0, 0.0, 0.0), 1.0, 1.0), device)
+        self.ranks = Ranks(device=device)
+        self.views = ViewSet(cameras, Space((0.0, 0.0, 0.0), 1.0, 1.0), device)
         points = scene.means[:: max(1, len(scene.means) // 100_000)].double().cpu().numpy()
         sizes, tour = [0] * len(cameras), tour_of(cameras, points)
         self.orders = {
-            "random": BatchSampler(sizes, batch_size, seed=0),
-            "tour": BatchSampler(sizes, batch_size, seed=0, tour=tour),
-            "flight": FlightOrder(sizes, batch_size, seed=0),
+            "random": BatchSampler(sizes, 1, seed=0),
+            "tour": BatchSampler(sizes, 1, seed=0, tour=tour),
+            "flight": FlightOrder(sizes, 1, seed=0),
         }
-        shape = (batch_size, scene.height, scene.width, 3)
-        self.targets = torch.randint(0, 256, shape, dtype=torch.uint8, device=device)
-        self.samples = torch.full((batch_size,), float(self.targets[0].numel()), device=device)
-        schedule = Schedule(ScheduleConfig(batch_size=batch_size))
-        self.optimiser = TableAdam(OptimiserConfig(*[RATE] * 5), schedule, 1.0, device)
-
-    def batch(self, indices: list[int]) -> Batch:
-        """Return views with photographs."""
-        return Batch(indices, self.views.pick(indices), self.targets, None, self.samples, None)
+        self.photographs = random_photographs(self.views.pick([0]))
+        self.optimiser = make_optimiser(Schedule(ScheduleConfig(batch_size=1)), device)
 
     def steps(self, stepper: Stepper, order: BatchSampler, first: int, count: int) -> float:
         """Take steps; return the seconds of one."""
 
         def take() -> None:
             for step in range(first, first + count):
-                frame, terms, _ = stepper.forward(step, OPTIONS, self.batch(order.batch(step - 1)))
-                stepper.backward(step, frame, terms)
+                indices = order.batch(step - 1)
+                batch = replace(self.photographs, indices=indices, views=self.views.pick(indices))
+                take_step(stepper, step, batch)
 
         return seconds_of(self.ranks.device, take) / count
 
@@ -108,30 +101,25 @@ def table_bytes(table: GaussianTable) -> int:
     return sum(table[name].nbytes for name in table)
 
 
-def measure_resident(
-    table: GaussianTable, over: Survey, orders: list[str], steps: int
-) -> list[dict[str, Any]]:
+def measure_resident(table: GaussianTable, over: Survey, steps: int) -> list[dict[str, Any]]:
     """Measure steps with all Gaussians on the device."""
     results, at = [], 1
     stepper = Stepper(table, over.optimiser, TileOwners(over.ranks), LOSS, 1.0)
-    for name in orders:
-        over.steps(stepper, over.orders[name], at, steps)
-        seconds = over.steps(stepper, over.orders[name], at + steps, steps)
+    for name, order in over.orders.items():
+        over.steps(stepper, order, at, steps)
+        seconds = over.steps(stepper, order, at + steps, steps)
         at += 2 * steps
         results.append({"arm": "resident", "order": name, "step_ms": 1e3 * seconds})
     stepper.catch_up(at - 1)
     return results
 
 
-def measure_pool(
-    table: HostTable, ratio: float, over: Survey, orders: list[str], steps: int, at: int
-) -> list[dict[str, Any]]:
+def measure_pool(table: HostTable, ratio: float, over: Survey, steps: int, at: int) -> list[dict[str, Any]]:
     """Measure steps with a pool; `at` is the first step."""
     results = []
     budget = int(table_bytes(table) / ratio)
     pool = Pool(table, over.ranks.device, budget, over.optimiser.pending_table)
-    for name in orders:
-        order = over.orders[name]
+    for name, order in over.orders.items():
         upcoming = UpcomingCameras(order, list(range(LINES * VIEWS_A_LINE)), over.views)
         stepper = OffloadingStepper(pool, upcoming, over.optimiser, TileOwners(over.ranks), LOSS, 1.0)
         result: dict[str, Any] = {"arm": f"{ratio:g}x", "order": name, "pool_gb": budget / 1e9}
@@ -156,20 +144,18 @@ def measure_pool(
     return results
 
 
-def run(
-    gaussians: int, ratios: list[float], orders: list[str], batch_size: int, steps: int, device: torch.device
-) -> Iterator[dict[str, Any]]:
+def run(gaussians: int, ratios: list[float], steps: int, device: torch.device) -> Iterator[dict[str, Any]]:
     """Measure all arms on one scene; yield the results so far after each pool."""
     scene = aerial(gaussians, device)
     scene = scene.rows(morton_order(scene.means))
-    over = Survey(scene, batch_size, device)
+    over = Survey(scene, device)
     table = make_table(scene)
-    about = {"scene": scene.name, "batch_size": batch_size, "table_gb": table_bytes(table) / 1e9}
+    about = {"scene": scene.name, "table_gb": table_bytes(table) / 1e9}
     del scene
-    results = measure_resident(table, over, orders, steps)
+    results = measure_resident(table, over, steps)
     by_order = {result["order"]: result["step_ms"] for result in results}
     yield about | {"results": with_cost(results, by_order)}
-    at = 1 + 2 * steps * len(orders)
+    at = 1 + 2 * steps * len(over.orders)
     host = {}
     for name in list(table.columns):
         host[name] = table.columns.pop(name).cpu()
@@ -177,8 +163,8 @@ def run(
     home = HostTable(host, pinned=device.type == "cuda")
     about["pin_s"] = time.perf_counter() - begin
     for ratio in ratios:
-        results += measure_pool(home, ratio, over, orders, steps, at)
-        at += 2 * steps * len(orders)
+        results += measure_pool(home, ratio, over, steps, at)
+        at += 2 * steps * len(over.orders)
         yield about | {"results": with_cost(results, by_order)}
 
 
@@ -195,16 +181,13 @@ def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("--gaussians", type=int, default=16_000_000)
     parser.add_argument("--ratios", type=float, nargs="+", default=[1, 2, 4])
-    orders = ["random", "tour", "flight"]
-    parser.add_argument("--orders", nargs="+", default=orders, choices=orders)
-    parser.add_argument("--batch-size", type=int, default=1)
     parser.add_argument("--steps", type=int, default=40)
     args = parser.parse_args()
     with torch.no_grad():
         device = torch.device(args.device)
-        for found in run(args.gaussians, args.ratios, args.orders, args.batch_size, args.steps, device):
+        for found in run(args.gaussians, args.ratios, args.steps, device):
             write_json(args.json, args.device, **found)
-    print(f"{found['scene']}, B = {args.batch_size}, table {found['table_gb']:.2f} GB")
+    print(f"{found['scene']}, table {found['table_gb']:.2f} GB")
     print("\n".join(offload_lines(found)))
     for row in found["results"]:
         if "failed" in row:

@@ -20,9 +20,9 @@ writes stress.md; --only "schedule=25.B=(4|16)$" chooses a part of it.
 Every run is a process. By default, each GPU has one run at a time. With more (--per-gpu) the models are as
 good, but times no longer compare, and the table says so. When a run ends, it writes a JSON file into
 RESULTS/runs. The same command then skips the runs that are finished and repeats those that failed.
-quality.json has all runs, quality.md the tables. --collect adds the runs of other folders, or of their
-quality.json, for example if several machines share the runs. In a copy without a repository, BLITZGS_COMMIT
-names the commit.
+quality.json and --json have all runs, quality.md the tables. --collect adds the runs of other folders, or of
+their quality.json, for example if several machines share the runs. In a copy without a repository,
+BLITZGS_COMMIT names the commit.
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ def train(specs: Sequence[RunSpec], pool: Pool, minutes: float | None) -> int:
 
 
 def make_parser() -> argparse.ArgumentParser:
-    parser = harness.make_parser(__doc__, device=None, writes_json=False)
+    parser = harness.make_parser(__doc__, device=None)
     harness.add_pool_flags(parser)
     parser.add_argument("--capture", action="append", default=[], metavar='"NAME=DIR [--data.FIELD=VALUE]"')
     parser.add_argument("--recipe", action="append", default=[], metavar='"NAME=SOURCE [--FIELD=VALUE]"')
@@ -246,8 +246,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, re.error) as error:
         parser.error(str(error))
     status = train(specs, pool, args.minutes)
+    runs = quality_report.read_runs(args.out / quality_report.RUNS)
+    harness.write_json(args.json, "cpu", **quality_report.origin_of(runs), runs=runs)
     if args.stress is not None:
-        table = stress_markdown(quality_report.read_runs(args.out / quality_report.RUNS))
+        table = stress_markdown(runs)
         (args.out / "stress.md").write_text(table)
         print(table)
     return status

@@ -20,13 +20,13 @@ from typing import Any
 
 import torch
 from harness import make_parser, stage_medians, write_json
+from report_tables import call_lines, render_lines, stage_lines
 from scenes import BenchmarkScene, aerial, garden_like
 from torch import Tensor
 
 from blitzgs import rasterization
 from blitzgs.frame.render import RenderOptions, backward_splats, inputs_of, render_frame, stage_ended
 from blitzgs.frame.transport.protocol import LocalTransport, stages_told_to
-from blitzgs.ops.projection_types import Views
 from blitzgs.table.table import GaussianTable
 
 try:
@@ -58,7 +58,7 @@ class OurRender:
 
     def __init__(self, scene: BenchmarkScene) -> None:
         self.table = GaussianTable.create(scene.raw())
-        self.views = Views(scene.viewmats, scene.Ks, scene.width, scene.height)
+        self.views = scene.views
         self.transport = LocalTransport()
 
     def forward(self) -> Tensor:
@@ -145,7 +145,7 @@ def stages(render: OurRender, v_renders: Tensor, repeats: int) -> dict[str, floa
 
 
 def run(name: str, repeats: int) -> dict[str, Any]:
-    """Measure one scene; prints as it goes."""
+    """Measure one scene."""
     scene = SCENES[name]()
     g = torch.Generator(device="cuda").manual_seed(1)
     v = torch.randn(len(scene.viewmats), scene.height, scene.width, 3, generator=g, device="cuda") * 1e-3
@@ -183,16 +183,9 @@ def main() -> None:
     args = parser.parse_args()
     results = []
     for name in args.scenes:
-        result = run(name, args.repeats)
-        results.append(result)
-        n_splats, entries = result["rows"], result["intersections"]
-        print(f"{result['scene']}: {result['visible']} visible, {n_splats} splats, {entries} intersections")
-        print("  " + "  ".join(f"{k} {v:.3f}" for k, v in result["stages"].items()))
-        for label, r in result.items():
-            if label not in ("scene", "visible", "rows", "intersections", "stages"):
-                print(f"  {label:16s} forward {r['forward']:7.3f}  backward {r['backward']:7.3f}  "
-                      f"total {r['total']:7.3f} ms  peak {r['peak_gb']:.2f} GB  "
-                      f"x{r['total'] / result['blitzgs']['total']:.2f}", flush=True)  # fmt: skip
+        results.append(run(name, args.repeats))
+        for lines in (render_lines, stage_lines, call_lines):
+            print("\n".join(lines({"results": results[-1:]})) + "\n", flush=True)
         torch.cuda.empty_cache()
     write_json(args.json, "cuda", results=results)
 

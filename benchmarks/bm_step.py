@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A whole training step on CUDA against gsplat with torch's fused Adam, stage by stage.
 
-    python benchmarks/bm_step.py [--scenes aerial4 aerial16] [--views 1] [--order morton] [--json FILE]
+    python benchmarks/bm_step.py [--scenes aerial4 aerial16] [--views 1] [--json FILE]
 
 SH degree 3, every parameter trained, gradients of L1 + SSIM. Ours is the trainer's own step
 (`blitzgs.training.step`): find the active rows, catch them up (they are 0 to 39 steps behind), render,
 compare, differentiate, step the visible rows, note the blocks that changed. gsplat: `rasterization` (not
 packed) and autograd, the same loss kernel, `torch.optim.Adam(fused=True)` over every row. Both get the same
-scene, by default in Morton order, as the trainer keeps its table. Medians of CUDA event times, ms.
+scene in Morton order, as the trainer keeps its table. Medians of CUDA event times, ms.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ from typing import Any
 import torch
 from bm_render import OPTIONS, CallRender
 from harness import make_parser, stage_medians, write_json
+from report_tables import step_lines
 from scenes import BenchmarkScene, aerial, garden_like
 
 from blitzgs.config.fields import LossConfig, OptimiserConfig, ScheduleConfig
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.ownership import TileOwners
+from blitzgs.frame.render import Frame
 from blitzgs.frame.transport.protocol import stage_ended, stages_told_to
 from blitzgs.ops.photometric import photometric_fwd_bwd
 from blitzgs.ops.projection_types import Views
@@ -40,24 +42,21 @@ GAUSSIANS = {"aerial1": 1_000_000, "aerial4": 4_000_000, "aerial16": 16_000_000}
 DRAWN_ROWS = 1 << 20  # rows whose moments are drawn at a time, so that a large table leaves room for them
 
 
-def make_scene(name: str, views: int, order: str) -> BenchmarkScene:
-    """Return a scene of `GAUSSIANS` or "garden", with its rows in the given order."""
+def make_scene(name: str, views: int) -> BenchmarkScene:
+    """Return a scene of `GAUSSIANS` or "garden", with its rows in Morton order."""
     if name == "garden":
         scene = garden_like(device="cuda", views=views)
     else:
         scene = aerial(GAUSSIANS[name], "cuda", views=views)
-    if order == "random":  # the generated order is random
-        return scene
     return scene.rows(morton_order(scene.means))
 
 
-def random_photographs(scene: BenchmarkScene) -> Batch:
-    """Return a batch of random photographs of the scene's views."""
-    count, device = len(scene.viewmats), scene.means.device
-    targets = torch.randint(0, 256, (count, scene.height, scene.width, 3), dtype=torch.uint8, device=device)
-    samples = torch.full((count,), float(targets[0].numel()), device=device)
-    views = Views(scene.viewmats, scene.Ks, scene.width, scene.height)
-    return Batch(list(range(count)), views, targets, None, samples, None)
+def random_photographs(views: Views) -> Batch:
+    """Return a batch of random photographs of views."""
+    shape, device = (len(views), views.height, views.width, 3), views.Ks.device
+    targets = torch.randint(0, 256, shape, dtype=torch.uint8, device=device)
+    samples = torch.full((len(views),), float(targets[0].numel()), device=device)
+    return Batch(list(range(len(views))), views, targets, None, samples, None)
 
 
 def make_table(scene: BenchmarkScene, rows: torch.Tensor | None = None) -> GaussianTable:
@@ -75,32 +74,44 @@ def make_table(scene: BenchmarkScene, rows: torch.Tensor | None = None) -> Gauss
     return table
 
 
+def make_optimiser(schedule: Schedule, device: torch.device | str) -> TableAdam:
+    """Return an optimiser whose steps hardly change the image."""
+    return TableAdam(OptimiserConfig(*[RATE] * 5), schedule, 1.0, device)
+
+
+def put_behind(stepper: Stepper, step: int) -> None:
+    """Let the rows have missed 0 to `BEHIND` - 1 steps when step number `step` begins."""
+    table = stepper.table
+    last = step - 1 - (table["id"] % BEHIND).int()
+    for name in ("last_step", "moment_step"):
+        table[name].copy_(last)
+    stepper.reindex()
+
+
+def take_step(stepper: Stepper, step: int, batch: Batch) -> Frame:
+    """Take a step of a training."""
+    frame, terms, _ = stepper.forward(step, OPTIONS, batch)
+    stepper.backward(step, frame, terms)
+    return frame
+
+
 class OurStep:
     """The trainer's step."""
 
     def __init__(self, scene: BenchmarkScene) -> None:
-        n = len(scene.means)
-        self.table = make_table(scene)
-        self.batch = random_photographs(scene)
-        schedule = Schedule(ScheduleConfig(batch_size=len(self.batch.views)))
-        optimiser = TableAdam(OptimiserConfig(*[RATE] * 5), schedule, 1.0, "cuda")
+        self.batch, self.step = random_photographs(scene.views), STEP
+        optimiser = make_optimiser(Schedule(ScheduleConfig(batch_size=len(self.batch.views))), "cuda")
         owners = TileOwners(Ranks(device=torch.device("cuda", torch.cuda.current_device())))
-        self.behind = torch.arange(n, device="cuda", dtype=torch.int32) % BEHIND
-        self.step = STEP
-        self.stepper = Stepper(self.table, optimiser, owners, LOSS, 1.0)
+        self.stepper = Stepper(make_table(scene), optimiser, owners, LOSS, 1.0)
 
     def prepare(self) -> None:
         """Set pending steps for every row, outside the timed stages."""
         self.step += 1
-        for name in ("last_step", "moment_step"):
-            self.table[name].copy_(self.step - 1 - self.behind)
-        self.stepper.reindex()
+        put_behind(self.stepper, self.step)
 
     def take(self) -> None:
         """Take one step."""
-        frame, terms, _ = self.stepper.forward(self.step, OPTIONS, self.batch)
-        self.stepper.backward(self.step, frame, terms)
-        self.visible = len(frame.projected.visible_ids)
+        self.visible = len(take_step(self.stepper, self.step, self.batch).projected.visible_ids)
 
 
 class GsplatStep:
@@ -110,7 +121,7 @@ class GsplatStep:
         from gsplat import rasterization
 
         self.render = CallRender(scene, partial(rasterization, packed=False))
-        self.batch = random_photographs(scene)
+        self.batch = random_photographs(scene.views)
         weights = ((1 - LOSS.ssim) / self.batch.samples, -LOSS.ssim / self.batch.samples)
         self.weights = [weight / len(scene.viewmats) for weight in weights]
         self.optimiser = torch.optim.Adam(self.render.parameters, lr=RATE, eps=1e-15, fused=True)
@@ -141,34 +152,27 @@ def measure(step: OurStep | GsplatStep, repeats: int) -> list[tuple[str, float]]
     return stage_medians(take, repeats, step.prepare)
 
 
-def run(name: str, views: int, order: str, repeats: int) -> dict[str, Any]:
-    """Measure both steps on one scene; prints as it goes."""
-    result: dict[str, Any] = {"views": views, "order": order}
+def run(name: str, views: int, repeats: int) -> dict[str, Any]:
+    """Measure both steps on one scene."""
+    result: dict[str, Any] = {"views": views}
     for label, kind in (("blitzgs", OurStep), ("gsplat + fused Adam", GsplatStep)):
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
-        scene = make_scene(name, views, order)
+        scene = make_scene(name, views)
         result["scene"] = scene.name
         try:
             step = kind(scene)
         except ImportError:
             continue
         times = measure(step, repeats)
-        peak = torch.cuda.max_memory_allocated() / 1e9
         # Stages of one name, at both ends of a step, count together.
         stages: dict[str, float] = {}
         for stage, ms in times:
             stages[stage] = stages.get(stage, 0.0) + ms
-        result[label] = {"ms": stages, "peak_gb": peak}
-        visible = f", {step.visible} visible" if isinstance(step, OurStep) else ""
-        print(f"{scene.name}, {views} view(s), {order} order{visible}: {label}")
-        print(f"  {', '.join(f'{stage} {ms:.3f}' for stage, ms in times)} ms  peak {peak:.2f} GB")
+        result[label] = {"ms": stages, "peak_gb": torch.cuda.max_memory_allocated() / 1e9}
         if isinstance(step, OurStep):
             result["visible"] = step.visible
         del step, scene
-    if "gsplat + fused Adam" in result:
-        ratio = result["gsplat + fused Adam"]["ms"]["total"] / result["blitzgs"]["ms"]["total"]
-        print(f"  ratio {ratio:.2f}", flush=True)
     return result
 
 
@@ -178,9 +182,11 @@ def main() -> None:
         "--scenes", nargs="+", default=["aerial4", "aerial16"], choices=[*GAUSSIANS, "garden"]
     )
     parser.add_argument("--views", type=int, default=1, help="views in a batch")
-    parser.add_argument("--order", default="morton", choices=["morton", "random"], help="of the rows")
     args = parser.parse_args()
-    results = [run(name, args.views, args.order, args.repeats) for name in args.scenes]
+    results = []
+    for name in args.scenes:
+        results.append(run(name, args.views, args.repeats))
+        print("\n".join(step_lines({"results": results[-1:]})) + "\n", flush=True)
     write_json(args.json, "cuda", results=results)
 
 

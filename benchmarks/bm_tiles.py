@@ -20,13 +20,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from bm_formats import read
 from harness import make_parser, report
 from torch import Tensor
 
 from blitzgs import rasterization
+from blitzgs.table.table import PARAMETERS
 from blitzgs.view.draw import intrinsics
 from blitzgs.viewer.world import looking
-from tests.helpers import read_glb
 
 # The flight begins and ends at these multiples of the distance of the page's first view.
 FARTHEST, NEAREST = 4.0, 0.05
@@ -54,15 +55,10 @@ class City:
         self._folder, self._parts, self._count = folder, [], 0
         self.leaves: list[slice] = []  # rows of the model
         self.root = self._tile(tileset["root"])
-        names = ["POSITION", "ROTATION", "SCALE", "OPACITY"]
-        names += [f"SH_DEGREE_{d}_COEF_{k}" for d in range(self.degree + 1) for k in range(2 * d + 1)]
-        columns = [
-            torch.from_numpy(np.concatenate([part[name] for part in self._parts])).to(device)
-            for name in names
-        ]
+        columns = (torch.cat([getattr(part, name) for part in self._parts]).to(device) for name in PARAMETERS)
+        self.means, self.quats, scales, opacities, self.sh = columns
+        self.scales, self.opacities = scales.exp(), opacities.sigmoid()
         self._parts.clear()
-        self.means, quats, self.scales, self.opacities = *columns[:3], columns[3][:, 0]
-        self.quats, self.sh = quats[:, [3, 0, 1, 2]].contiguous(), torch.stack(columns[4:], dim=1)
 
     def __len__(self) -> int:
         return self._count
@@ -70,9 +66,8 @@ class City:
     def _tile(self, node: dict[str, Any]) -> Tile:
         box = np.array(node["boundingVolume"]["box"])
         start, path = self._count, self._folder / node["content"]["uri"]
-        attributes = read_glb(path)[1].items()
-        self._parts.append({name.rpartition(":")[2]: values for name, values in attributes})
-        self._count += len(self._parts[-1]["POSITION"])
+        self._parts.append(read(path))
+        self._count += len(self._parts[-1])
         rows, size = slice(start, self._count), path.stat().st_size
         children = [self._tile(child) for child in node.get("children", [])]
         if not children:

@@ -2,11 +2,10 @@
 """Measures the viewer: pictures a second that are drawn, and that a client on the same host receives.
 
     python benchmarks/bm_view.py [--gaussians 12000000] [--model RUN|FILE.ply] [--size 1920x1080]
-                                 [--seconds 10] [--full] [--device cuda] [--json FILE]
+                                 [--seconds 10] [--device cuda] [--json FILE]
 
 A client without a browser orbits around the middle and counts the pictures that arrive, after two seconds of
-warming up. "drawn alone" is the renderer of the viewer without server and client. With --full, pictures are
-at full quality also while the camera moves; on a GPU they usually are anyway.
+warming up. "drawn alone" is the renderer of the viewer without server and client.
 """
 
 from __future__ import annotations
@@ -85,7 +84,7 @@ def drawn_alone(opened: Opened, size: tuple[int, int], seconds: float) -> dict[s
     }
 
 
-def served(opened: Opened, size: tuple[int, int], seconds: float, full: bool) -> dict[str, float]:
+def served(opened: Opened, size: tuple[int, int], seconds: float) -> dict[str, float]:
     """Serve the page to a client in a process of its own."""
     import viser
 
@@ -104,7 +103,7 @@ def served(opened: Opened, size: tuple[int, int], seconds: float, full: bool) ->
         while not studio.page.visitors and time.monotonic() < end and client.poll() is None:
             time.sleep(0.01)
         for visitor in list(studio.page.visitors.values()):
-            visitor.change(adapts=not full, most_side=max(size))
+            visitor.change(most_side=max(size))
         time.sleep(WARM_UP)
         before, begin = studio.drawn, time.monotonic()
         time.sleep(max(0.1, seconds - 0.5))
@@ -123,7 +122,6 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--model", type=Path, help="a run or a PLY file instead of the synthetic scene")
     parser.add_argument("--size", default="1920x1080")
     parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--full", action="store_true")
     options = parser.parse_args(arguments)
     extend_memory_in_place()  # as `blitzgs view`
     width, height = (int(text) for text in options.size.split("x"))
@@ -142,7 +140,7 @@ def main(arguments: list[str] | None = None) -> None:
         torch.cuda.reset_peak_memory_stats(ranks.device)
         held = torch.cuda.memory_allocated(ranks.device)
     row |= drawn_alone(opened, (width, height), options.seconds)
-    row |= served(opened, (width, height), options.seconds, options.full)
+    row |= served(opened, (width, height), options.seconds)
     if on_gpu:
         row["mb_above_model"] = (torch.cuda.max_memory_reserved(ranks.device) - held) / 1e6
         row["mb_of_that_in_use"] = (torch.cuda.max_memory_allocated(ranks.device) - held) / 1e6

@@ -291,9 +291,6 @@ def main(arguments: list[str] | None = None) -> int:
                         help="entries of tests/ that run side by side (%(default)s)")  # fmt: skip
     parser.add_argument("--resume", action="store_true", help="go on with a record that was cut off")
     parser.add_argument("--age", action="store_true", help="only tell the age of the record; status 0")
-    parser.add_argument("--tests", type=Path, nargs="+", default=[harness.ROOT / "tests"],
-                        help="folders or files of tests (%(default)s)")  # fmt: skip
-    parser.add_argument("--mark", default="cuda and not slow", help="of the tests (%(default)s)")
     args = parser.parse_args(arguments)
     path = args.out.resolve() / NAME
     if args.age:
@@ -315,8 +312,8 @@ def main(arguments: list[str] | None = None) -> int:
     logs = path.parent / "gpu_record"
     logs.mkdir(parents=True, exist_ok=True)
     record = Record(path, about, args.resume)
-    tests = [test.resolve() for test in args.tests]
-    passed = make_record(record, tests, args.mark, logs, end, 60 * args.entry_minutes, args.jobs)
+    tests, mark = [harness.ROOT / "tests"], "cuda and not slow"
+    passed = make_record(record, tests, mark, logs, end, 60 * args.entry_minutes, args.jobs)
     print(f"{path}: {'complete' if record.content['complete'] else 'cut off; go on with --resume'}")
     return 0 if passed else 1
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 import json
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 import time
@@ -57,8 +56,7 @@ def is_measured(path: Path) -> bool:
     """Tell whether a file of results is of this commit."""
     if not path.exists():
         return False
-    found = json.loads(path.read_text())
-    return {run["commit"] for run in found.get("runs", [found])} == {harness.commit()}
+    return json.loads(path.read_text())["commit"] == harness.commit()
 
 
 def words_of(job: Job, captures: dict[str, str], result: Path) -> list[str]:
@@ -71,8 +69,7 @@ def words_of(job: Job, captures: dict[str, str], result: Path) -> list[str]:
     if job.name == "accuracy" and not (harness.ROOT / "build-exact").exists():
         at = words.index("--exact-library")
         del words[at : at + 2]
-    # bm_quality.py collects its runs in one file of its folder.
-    json_flag = [] if job.part or job.name == "quality" else ["--json", str(result)]
+    json_flag = [] if job.part else ["--json", str(result)]
     return [sys.executable, str(harness.ROOT / words[0]), *words[1:], *json_flag]
 
 
@@ -102,8 +99,6 @@ def run_all(jobs: list[Job], gpus: int, work: Path, captures: dict[str, str], re
             free = sorted([*free, *mine])
             ended = "done" if process.returncode == 0 else f"FAILED, see {work / job.label}.log"
             status |= int(process.returncode != 0)
-            if process.returncode == 0 and job.name == "quality":
-                shutil.copy(work / "runs" / "quality" / "quality.json", results)
             now = time.monotonic()
             print(f"{now - begin:.0f} s: {job.label}: {ended} after {now - started:.0f} s", flush=True)
         time.sleep(0.1)

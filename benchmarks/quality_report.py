@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from harness import markdown_table
+from harness import command_line, markdown_table
 from quality_run import write
 
 RUNS = "runs"
@@ -44,6 +44,16 @@ def collect(out: Path, sources: Iterable[Path]) -> None:
             path = out / RUNS / f"{run['name']}.json"
             if run["status"] == "done" or not path.exists():
                 write(path, run)
+
+
+def origin_of(runs: Sequence[Run]) -> dict[str, Any]:
+    """Return command, commit and environment of runs, as `harness.write_json` takes them."""
+    known = [run for run in runs if "environment" in run]  # those that got as far as their training
+    return {
+        "command": command_line(),
+        "commit": " and ".join(sorted({run["commit"] for run in known})) or "unknown",
+        "environment": known[0]["environment"] if known else {},
+    }
 
 
 def is_done(out: Path, name: str) -> bool:

@@ -13,11 +13,12 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from harness import ROOT, commit, environment, synchronize
+from harness import ROOT, commit, environment, seconds_of, synchronize
 from opponents import spatial_partition
 from opponents.gsplat_training import GsplatTrainer
 from quality_plan import RunSpec
@@ -163,11 +164,7 @@ def train_opponent(spec: RunSpec, ranks: Ranks) -> dict[str, Any]:
     quoted = [options.scaled(step) for step in QUOTED_STEPS]
     recorder, seconds = Recorder(spec, quoted, trainer.total, capture, ranks.device), 0.0
     for mark in recorder.marks:
-        synchronize(ranks.device)
-        begin = time.monotonic()
-        trainer.train_to(mark)
-        synchronize(ranks.device)
-        seconds += time.monotonic() - begin
+        seconds += seconds_of(ranks.device, partial(trainer.train_to, mark))
         count = len(trainer.params["means"])
         recorder.record(mark, seconds, count, mark == trainer.total, measure_now)
     return figures(recorder, trainer.peak)
@@ -184,7 +181,7 @@ def train_partition(spec: RunSpec, ranks: Ranks) -> dict[str, Any]:
     split_seconds = time.monotonic() - begin
     merged = spatial_partition.train(config, capture, images, ranks, grid, blocks)
     space = Space.of(capture.offset, capture.extent)
-    views = ViewSet(list(capture.cameras), space, ranks.device)
+    views = ViewSet(capture.cameras, space, ranks.device)
     lpips, owners = load_lpips(spec.lpips), TileOwners(ranks)
 
     def measure_now(indices: Sequence[int]) -> dict[str, Any]:

@@ -52,29 +52,10 @@ COMMANDS = {
 }
 # Results that compare with no other: the record of the tests, and what the recipes reach.
 APART = ("gpu_record", "quality")
-# After commands that take no --json: gpu_record.py writes its file itself, bm_quality.py collects all of its
-# runs in one file.
-COPIED = {
-    "gpu_record": "python benchmarks/report.py",
-    "quality": "cp runs/quality/quality.json benchmarks/results/quality.json",
-}
 
 
 class ReportError(Exception):
     """The results cannot be reported; the message says why."""
-
-
-def with_origin(name: str, file: Json) -> Json:
-    """Return a file with "command", "commit" and "environment", which collected runs have one by one."""
-    if "runs" not in file:
-        return file
-    done = [run for run in file["runs"] if run["status"] == "done"]
-    about = {
-        "command": COMMANDS[name],
-        "commit": " and ".join(sorted({run["commit"] for run in done})) or "unknown",
-        "environment": done[0]["environment"] if done else {},
-    }
-    return about | file
 
 
 def load_results(folder: Path = RESULTS) -> Results:
@@ -86,7 +67,7 @@ def load_results(folder: Path = RESULTS) -> Results:
     for path in sorted(folder.glob("*.json")):
         if path.stem not in COMMANDS:
             raise ReportError(f"{path}: no table is made of it; known names: {', '.join(COMMANDS)}")
-        results[path.stem] = with_origin(path.stem, json.loads(path.read_text()))
+        results[path.stem] = json.loads(path.read_text())
         commit = results[path.stem].get("commit", "unknown")
         if commit == "unknown" or commit.endswith("+changes"):
             raise ReportError(
@@ -125,14 +106,10 @@ def section_lines(name: str, results: Results) -> list[str]:
     section = SECTIONS[name]
     missing = [file for file in section.files if file not in results]
     if missing:
+        # gpu_record.py, which `make` runs, writes its file itself.
         commands = [
-            line
+            COMMANDS[file] + ("" if file == "gpu_record" else f" --json benchmarks/results/{file}.json")
             for file in missing
-            for line in (
-                [COMMANDS[file], COPIED[file]]
-                if file in COPIED
-                else [f"{COMMANDS[file]} --json benchmarks/results/{file}.json"]
-            )
         ]
         return ["Not measured yet. The commands that measure it:", "",
                 *(f"    {command}" for command in commands)]  # fmt: skip

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.formats.gaussians import SH_C0
+from blitzgs.ops.projection_types import Views
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,11 @@ class BenchmarkScene:
     Ks: Tensor  # [B, 3, 3]
     width: int
     height: int
+
+    @property
+    def views(self) -> Views:
+        """The cameras as the renderer takes them."""
+        return Views(self.viewmats, self.Ks, self.width, self.height)
 
     def raw(self) -> dict[str, Tensor]:
         """Return the parameters before activation: log scales and logit opacities."""

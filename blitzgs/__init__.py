@@ -14,7 +14,8 @@ if TYPE_CHECKING:
         rasterize_num_contributing_gaussians,
         rasterize_top_contributing_gaussian_ids,
     )
-    from blitzgs.call.gaussians import knn, l1_ssim, position_noise, quat_scale_to_covar_preci, relocate
+    from blitzgs.call.gaussians import knn, position_noise, quat_scale_to_covar_preci, relocate
+    from blitzgs.call.losses import l1_ssim
     from blitzgs.ops.harmonics import spherical_harmonics
     from blitzgs.runs.folder import open_run
     from blitzgs.table.blocks import morton_order
@@ -46,7 +47,8 @@ _MODULES = {
         "rasterize_num_contributing_gaussians",
         "rasterize_top_contributing_gaussian_ids",
     ),
-    "blitzgs.call.gaussians": ("knn", "l1_ssim", "position_noise", "quat_scale_to_covar_preci", "relocate"),
+    "blitzgs.call.gaussians": ("knn", "position_noise", "quat_scale_to_covar_preci", "relocate"),
+    "blitzgs.call.losses": ("l1_ssim",),
     "blitzgs.ops.harmonics": ("spherical_harmonics",),
     "blitzgs.runs.folder": ("open_run",),
     "blitzgs.table.blocks": ("morton_order",),

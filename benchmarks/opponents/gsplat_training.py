@@ -188,7 +188,7 @@ class GsplatTrainer:
         self._decay = torch.optim.lr_scheduler.ExponentialLR(
             self._optimisers["means"], gamma=0.01 ** (1.0 / self.total)
         )
-        self.views = ViewSet(list(capture.cameras), self.space, device)
+        self.views = ViewSet(capture.cameras, self.space, device)
         self._batches = []
         for index in capture.train:
             mask = images.mask(index)

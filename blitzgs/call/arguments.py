@@ -16,6 +16,7 @@ from blitzgs._torch import func_transforms_are_active
 from blitzgs.call.covariances import Decomposed
 from blitzgs.capture.cameras import MAX_SIDE
 from blitzgs.ops.harmonics import MAX_SH_DEGREE, colors_of_views
+from blitzgs.ops.intersect import TILE_SIZE
 from blitzgs.ops.projection_types import ProjectionOptions
 from blitzgs.ops.unscented import Lenses
 from blitzgs.util.errors import warn
@@ -25,7 +26,6 @@ RASTERIZE_MODES = ("classic", "antialiased")
 CAMERA_MODELS = ("pinhole", "fisheye")
 # What the kernels evaluate; torch evaluates other SH before them.
 KERNEL_SH_DEGREE, KERNEL_SH_CHANNELS = 3, 3
-DEFAULT_TILE_SIZE = 16
 # What the kernels can composite (csrc/rasterize/rasterize_op.cpp).
 MAX_CHANNELS = 4096
 # Further arguments of gsplat's calls (1.5.3 and later) and their defaults; no other values are supported.
@@ -141,7 +141,7 @@ def checked_options(
     raw: bool = False,  # whether scales and opacities are before their activation
 ) -> ProjectionOptions:
     """Check the arguments that are not tensors (TypeError, ValueError); return the projection's options."""
-    tile_size = DEFAULT_TILE_SIZE if tile_size is None else tile_size
+    tile_size = TILE_SIZE if tile_size is None else tile_size
     degree = 0 if sh_degree is None else sh_degree
     whole = {"width": width, "height": height, "tile_size": tile_size, "sh_degree": degree}
     for name, value in whole.items():

@@ -51,7 +51,6 @@ class CamerasOnHost:
     """Copies cameras to the host while the device works; for calls that do not learn what each view sees."""
 
     def __init__(self, gaussians: Gaussians) -> None:
-        """Start to copy the cameras of a call."""
         named = gaussians.named
         matrices = [t.detach().reshape(-1) for name in ("Ks", "viewmats") for t in named[name]]
         self._n_intrinsics = sum(t.numel() for t in named["Ks"])

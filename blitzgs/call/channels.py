@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The channels that an image composites: colours, extra signals, normals and depth, in this order."""
+"""The channels that an image composites, and the images that a caller gets of them.
+
+Channels are colours, extra signals, normals and depth, in this order.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,9 @@ from torch.nn.functional import embedding
 
 from blitzgs.call.arguments import Gaussians
 from blitzgs.call.extras import NORMAL_CHANNELS, Pixels
+from blitzgs.call.layout import Lists
 from blitzgs.ops.harmonics import spherical_harmonics
+from blitzgs.ops.importance import pixel_splats
 from blitzgs.ops.projection_types import ProjectedSplats
 
 
@@ -69,7 +74,7 @@ def channels_of(
     return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
 
 
-def split_channels(
+def _split_channels(
     renders: Tensor, gaussians: Gaussians, image: ImageOptions
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Divide an image into colours with depth, and what `meta` has: extra signals and normals, by key."""
@@ -85,6 +90,48 @@ def split_channels(
         begin += width
     # A copy: the caller may change one image in place, and view it in any shape.
     return torch.cat([colours, renders[..., begin:]], dim=-1), beside
+
+
+def images_of_caller(
+    renders: Tensor,  # all channels, [I, H, W, channels]
+    alphas: Tensor,  # [I, H, W]
+    gaussians: Gaussians,
+    image: ImageOptions,
+    lead: tuple[int, ...],  # batch dimensions, and the number of views that are rendered here
+    splats: ProjectedSplats,  # that were composited
+    lists: Lists,  # by which they were
+) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """Return images and alphas as the caller asked for them, and the further images of `meta` by key."""
+    alphas = alphas.unsqueeze(-1)
+    if image.pixels is not None:
+        renders, alphas = (t.flatten(0, 2).index_select(0, image.pixels.numbers) for t in (renders, alphas))
+    others: dict[str, Tensor] = {}
+    if gaussians.signals is not None or image.normals:
+        renders, others = _split_channels(renders, gaussians, image)
+    if image.median:
+        others["render_median"] = _median_depths(splats, lists, image.pixels)
+    if image.render_mode.endswith("ED"):
+        # Autograd saves the divisor. It is a copy, so that the caller may change alphas in place.
+        covered = alphas.clone().clamp_(min=1e-10)
+        renders = torch.cat([renders[..., :-1], renders[..., -1:] / covered], dim=-1)
+    if len(lead) > 1 and image.pixels is None:
+        shape = (*lead, *renders.shape[1:3])
+        renders, alphas = renders.view(*shape, renders.shape[-1]), alphas.view(*shape, 1)
+        others = {key: values.view(*shape, values.shape[-1]) for key, values in others.items()}
+    return renders, alphas, others
+
+
+def _median_depths(splats: ProjectedSplats, lists: Lists, pixels: Pixels | None) -> Tensor:
+    """Return the depth of the splat at which half the light of each pixel is gone, [I, H, W, 1] or [M, 1]."""
+    n_cameras, width, height, tile_size, *_ = lists.grid
+    found = pixel_splats(
+        splats.means2d, splats.conics, splats.opacities, lists.splats, lists.offsets, n_cameras=n_cameras,
+        width=width, height=height, tile_size=tile_size, pixels=None if pixels is None else pixels.numbers,
+    )  # fmt: skip
+    # Before the first splat stands the depth of a pixel without splats.
+    table = torch.cat([splats.depths.new_zeros(1), splats.depths])
+    depths = table.index_select(0, found.medians + 1)
+    return depths.view(-1, 1) if pixels is not None else depths.view(n_cameras, height, width, 1)
 
 
 def _signals(splats: ProjectedSplats, gaussians: Gaussians, with_spare: bool) -> Tensor:

@@ -63,13 +63,16 @@ def contributions(
     Warns, raises:
         As `blitzgs.rasterization`; all arguments are looked at for values that are not finite.
     """
-    options = checked_options(width, height, near_plane, far_plane, 0.0, eps2d, None, None, rasterize_mode)
+    options = checked_options(
+        width, height, near_plane, far_plane, radius_clip=0.0, eps2d=eps2d, sh_degree=None, tile_size=None,
+        rasterize_mode=rasterize_mode,
+    )  # fmt: skip
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     check_tensors({**tensors, "viewmats": viewmats, "Ks": Ks}, {})
     if means.dim() != 2:
         raise ValueError(f"means must be [N, 3], got {list(means.shape)}")
     scene = Scene(means, quats, scales, opacities, None, viewmats, Ks)
-    gaussians = gaussians_of("contributions", scene, None, "D")
+    gaussians = gaussians_of("contributions", scene, sh_degree=None, render_mode="D")
     warn_of_non_finite(gaussians)
     check_intrinsics([Ks])
     shape = (len(viewmats), len(means))
@@ -82,7 +85,7 @@ def contributions(
         geometry = splats.means2d, splats.conics, splats.opacities
         grid = TileGrid(len(cameras[0]), width, height, options.tile_size)
         lists = torch.ops.blitzgs.intersect(
-            *geometry, splats.depths, splats.camera_ids, None, *grid, int(splats.counts[2]), None, True
+            *geometry, splats.depths, splats.camera_ids, None, *grid, int(splats.counts[2]), unchecked=True
         )
         splat_weights, splat_pixels, _ = torch.ops.blitzgs.contributions(*geometry, *lists, *grid)
         at = splats.camera_ids.long() + begin, splats.gaussian_ids.long()

@@ -19,12 +19,9 @@ from torch import Tensor
 import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs.call.extras import Pixels
 from blitzgs.ops.derivatives import linear_map
-from blitzgs.ops.intersect import TileGrid
+from blitzgs.ops.intersect import TILE_SIZE, TileGrid
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionOptions
 from blitzgs.ops.rasterize import MetaGeometry
-
-# The tile size of the CUDA kernels. If the caller asks for another one, only meta's lists have it.
-CUDA_TILE_SIZE = 16
 
 
 class Places(NamedTuple):
@@ -110,7 +107,6 @@ class Layout:
         packed: bool,
         under: Tensor | None,  # opacities of Gaussians without a splat, [..., N]; None: zero
     ) -> None:
-        """Compute the arrangement."""
         self.splats, self.packed = splats, packed
         self.places: Places | None = None  # of each splat in `meta`; None: the order is unchanged
         if not packed:
@@ -190,13 +186,14 @@ def lists_of(
         if pixels is not None:
             return _lists_of_pixels(splats, grid, pixels)
         own = (splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids)
-        entries, offsets = torch.ops.blitzgs.intersect(*own, None, *grid, n_isects, None, True)
+        entries, offsets = torch.ops.blitzgs.intersect(*own, None, *grid, n_isects, unchecked=True)
         return Lists(entries, offsets, grid)
 
     lists = listed_by(projection.tile_size, count)
-    if not splats.means2d.is_cuda or projection.tile_size == CUDA_TILE_SIZE:
+    if not splats.means2d.is_cuda or projection.tile_size == TILE_SIZE:
         return lists, lists
-    return lists, listed_by(CUDA_TILE_SIZE, -1)
+    # The CUDA kernels composite tiles of one size alone: only meta's lists have that which was asked for.
+    return lists, listed_by(TILE_SIZE, -1)
 
 
 def _lists_of_pixels(splats: ProjectedSplats, grid: TileGrid, pixels: Pixels) -> Lists:
@@ -206,7 +203,7 @@ def _lists_of_pixels(splats: ProjectedSplats, grid: TileGrid, pixels: Pixels) ->
     near = _splats_near(splats, wanted, edge)
     own = (splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids)
     chosen = [column.detach().index_select(0, near) for column in own]
-    listed, offsets = torch.ops.blitzgs.intersect(*chosen, None, *grid, -1, None, True)
+    listed, offsets = torch.ops.blitzgs.intersect(*chosen, None, *grid, -1, unchecked=True)
     lengths, count = offsets.diff(), int(offsets[-1])
     kept = wanted.view(-1).repeat_interleave(lengths, output_size=count)
     ends = (lengths * wanted.view(-1)).cumsum(0)

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from blitzgs.call.arguments import (
     CAMERA_MODELS,
-    DEFAULT_TILE_SIZE,
     RENDER_MODES,
     Scene,
     check_choice,
@@ -23,6 +22,7 @@ from blitzgs.call.channels import ImageOptions, background_rows
 from blitzgs.call.extras import check_without_ut, checked_pixels, with_covariances, with_lenses, with_signals
 from blitzgs.call.ranks import gather_views
 from blitzgs.call.render import render
+from blitzgs.ops.intersect import TILE_SIZE
 from blitzgs.util.errors import explain_memory
 
 # Colours of networks under autocast, and of SH tables in half precision.
@@ -45,7 +45,7 @@ def rasterization(
     eps2d: float = 0.3,
     sh_degree: int | None = None,
     packed: bool = True,
-    tile_size: int | None = DEFAULT_TILE_SIZE,
+    tile_size: int | None = TILE_SIZE,
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
     sparse_grad: bool = False,

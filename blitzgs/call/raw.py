@@ -15,7 +15,6 @@ from torch import Tensor
 from blitzgs._torch import not_compiled
 from blitzgs.call.arguments import (
     ANY,
-    DEFAULT_TILE_SIZE,
     GSPLAT_DEFAULTS,
     KERNEL_SH_DEGREE,
     RENDER_MODES,
@@ -28,8 +27,9 @@ from blitzgs.call.arguments import (
 )
 from blitzgs.call.channels import ImageOptions, background_rows
 from blitzgs.call.rasterize import rasterization
-from blitzgs.call.render import ShTables, gathered_groups, groups_may_be_queued, groups_of, render
+from blitzgs.call.render import ShTables, render
 from blitzgs.ops.derivatives import of_shape
+from blitzgs.ops.intersect import TILE_SIZE
 
 
 @not_compiled
@@ -49,7 +49,7 @@ def raw_rasterization(
     radius_clip: float = 0.0,
     eps2d: float = 0.3,
     sh_degree: int | None = None,
-    tile_size: int | None = DEFAULT_TILE_SIZE,
+    tile_size: int | None = TILE_SIZE,
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
     sparse_grad: bool = True,
@@ -93,7 +93,16 @@ def raw_rasterization(
     if further:
         check_further("raw_rasterization", further, _defaults())
     projection = checked_options(
-        width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, tile_size, rasterize_mode, True
+        width,
+        height,
+        near_plane,
+        far_plane,
+        radius_clip,
+        eps2d,
+        sh_degree,
+        tile_size,
+        rasterize_mode,
+        raw=True,
     )
     check_choice("render_mode", render_mode, RENDER_MODES)
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh0": sh0}
@@ -115,7 +124,8 @@ def raw_rasterization(
     sh_degree = _checked_degree(harmonics, len(means), sh_degree, shaded)
     projection = projection._replace(sh_degree=sh_degree)
     scene = Scene(means, quats, scales, opacities, None, viewmats, Ks)
-    whole = gaussians_of("raw_rasterization", scene, None, "D", raw=True)
+    # The SH are not part of the scene: only their visible rows are read.
+    whole = gaussians_of("raw_rasterization", scene, sh_degree=None, render_mode="D", raw=True)
     if sparse_grad and torch.is_grad_enabled():
         _check_leaves(params | sh_params if shaded else params)
     given = {**tensors, "viewmats": viewmats, "Ks": Ks, "shN": shN}
@@ -125,19 +135,13 @@ def raw_rasterization(
     colors, degree = (sh0, sh_degree) if shaded else (None, None)
     gaussians = whole._replace(colors=colors, sh_degree=degree, named=named)
     background = background_rows(backgrounds, gaussians, render_mode)
-    image = ImageOptions(render_mode, background, True, sparse_grad, absgrad)
+    image = ImageOptions(render_mode, background, packed=True, sparse_grad=sparse_grad, absgrad=absgrad)
 
     def catch_up_sh(rows: Tensor, count: Tensor | None) -> None:
         for optimizer in lazy:
             optimizer.catch_up(sh_params.values(), rows, count)
 
-    groups = groups_of(gaussians, projection)
-    tables = ShTables(harmonics if shaded else (), catch_up_sh)
-    if groups_may_be_queued(groups):
-        return render(gaussians, projection, image, tables=tables, groups=groups)
-    # Several groups, no Gaussians, or another tile size: gather the Gaussians that any group sees.
-    groups = gathered_groups(groups, tables, sparse_grad)
-    return render(gaussians, projection, image, groups=groups)
+    return render(gaussians, projection, image, tables=ShTables(harmonics if shaded else (), catch_up_sh))
 
 
 @cache

@@ -18,19 +18,17 @@ from torch import Tensor
 from blitzgs._torch import hooks_on_saved_tensors
 from blitzgs.call.arguments import Gaussians, Scene
 from blitzgs.call.bad_values import CamerasOnHost, check_intrinsics, watch_for_non_finite
-from blitzgs.call.channels import ImageOptions, channels_of, split_channels
+from blitzgs.call.channels import ImageOptions, channels_of, images_of_caller
 from blitzgs.call.covariances import Decomposed, shaped_by
-from blitzgs.call.extras import Pixels
-from blitzgs.call.layout import CUDA_TILE_SIZE, Layout, Lists, lists_of
+from blitzgs.call.layout import Layout, Lists, lists_of
 from blitzgs.call.meta import make_meta
 from blitzgs.call.ranks import send_splats
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.render import run_attempts
 from blitzgs.frame.transport.protocol import Exchange, LocalTransport
 from blitzgs.ops.derivatives import rows_of_tables
-from blitzgs.ops.importance import pixel_splats
-from blitzgs.ops.intersect import TileGrid
-from blitzgs.ops.project import differentiable_splats, gaussian_tensors, project_splats
+from blitzgs.ops.intersect import TILE_SIZE, TileGrid
+from blitzgs.ops.project import differentiable_splats, project_splats
 from blitzgs.ops.projection_types import (
     MAX_VIEWS,
     VIEW_TOTALS,
@@ -49,7 +47,7 @@ _EXACT = LocalTransport(exact=True)
 _LISTS, _IMAGES = 2, 8
 
 
-class Group(NamedTuple):
+class _Group(NamedTuple):
     """Views of one scene that are projected together."""
 
     inputs: ProjectionInputs
@@ -72,25 +70,20 @@ def render(
     gaussians: Gaussians,
     projection: ProjectionOptions,
     image: ImageOptions,
-    tables: ShTables | None = None,  # the SH, if only visible rows are read (`groups_may_be_queued`)
     ranks: Ranks | None = None,  # among which Gaussians and views are divided; None: all here
-    groups: Sequence[Group] | None = None,  # `groups_of` Gaussians with SH, if already known
+    tables: ShTables | None = None,  # the SH, if only the rows of visible Gaussians are read
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render images; return the results of `blitzgs.rasterization`."""
     compiling = torch.compiler.is_compiling()
-    nan_marks: list[Tensor] = []
-    if groups is None:
-        shown, nan_marks = _without_non_finite(gaussians)
-        groups = groups_of(shown, projection)
-    with_others = gaussians.signals is not None or image.normals
-    only_colors = gaussians.sh_degree is not None and not with_others and image.render_mode == "RGB"
+    shown, nan_marks = _without_non_finite(gaussians)
+    groups = _groups_of(shown, projection)
     queued, cameras = None, None
-    if ranks is None and not compiling and image.pixels is None and groups_may_be_queued(groups):
-        queued = _render_queued(groups[0].inputs, gaussians, image, only_colors, tables)
-        splats = differentiable_splats(queued.inputs, image.sparse_grad and tables is None, queued.splats)
+    if ranks is None and not compiling and image.pixels is None and _may_be_queued(groups):
+        queued = _render_queued(groups[0].inputs, gaussians, image, tables)
+        splats = queued.splats
     else:
         cameras = None if compiling else CamerasOnHost(gaussians)
-        splats = _project_groups(groups, image.sparse_grad)
+        splats = _project_groups(groups, image.sparse_grad, tables)
     # As in gsplat, Gaussians without a splat have their own opacity.
     over_all = not (image.packed or projection.antialiased or image.sparse_grad)
     under = gaussians.opacities if over_all else None
@@ -98,7 +91,8 @@ def render(
     rendered, meta_geometry = layout.splats_to_composite(
         gathered=compiling or ranks is not None, depths=image.render_mode != "RGB" or image.median
     )
-    channels = rendered.colors if only_colors else channels_of(rendered, gaussians, image)
+    store_absgrad = layout.absgrad_store() if image.absgrad else None
+    channels = channels_of(rendered, gaussians, image)
     lead = gaussians.lead
     if ranks is not None:
         lead = (gaussians.views // ranks.world_size,)
@@ -116,8 +110,8 @@ def render(
         rendered.means2d, rendered.conics, rendered.opacities, channels,
         composited_lists.splats, composited_lists.offsets, n_cameras=images, width=projection.width,
         height=projection.height, tile_size=composited_lists.grid.tile_size, backgrounds=image.backgrounds,
-        store_absgrad=layout.absgrad_store() if image.absgrad else None,
-        composited=None if queued is None else queued.composited, meta_geometry=meta_geometry,
+        store_absgrad=store_absgrad, composited=None if queued is None else queued.composited,
+        meta_geometry=meta_geometry,
     )  # fmt: skip
     if not compiling:
         # A view with a bad camera sees no Gaussian. Reading `cameras` does not wait: they were copied before.
@@ -126,17 +120,17 @@ def render(
             check_intrinsics(gaussians.named["Ks"])
             suspects_cameras = True
         watch_for_non_finite(gaussians, layout, nan_marks, suspects_cameras)
-    median = _median_depths(rendered, composited_lists, image.pixels) if image.median else None
-    renders, alphas, others = _images_of_caller(renders, alphas, median, gaussians, image, lead)
+    renders, alphas, others = images_of_caller(
+        renders, alphas, gaussians, image, lead, rendered, composited_lists
+    )
     arrived = None if ranks is None else rendered
     return renders, alphas, make_meta(gaussians, layout, others, lists, lead, arrived)
 
 
 class _Queued(NamedTuple):
-    """The outputs of the ops; see each op for its fields."""
+    """What `_render_queued` returns."""
 
-    splats: ProjectedSplats
-    inputs: ProjectionInputs  # what the splats were projected from, in autograd's graph
+    splats: ProjectedSplats  # in autograd's graph
     lists: Lists
     composited: Sequence[Tensor]  # what `rasterize_fwd` returned, and alphas
     has_blank_view: bool  # whether some view sees no Gaussian
@@ -146,10 +140,9 @@ def _render_queued(
     inputs: ProjectionInputs,
     gaussians: Gaussians,
     image: ImageOptions,
-    only_colors: bool,  # whether the colours that the projection computes are all channels
     tables: ShTables | None,  # the SH, if they are not part of `inputs`
 ) -> _Queued:
-    """Render without gradients; the host queues all work first if earlier calls had the same size."""
+    """Project, list and composite; the host queues all of it first if earlier calls had the same size."""
     options, means, signals = inputs.options, inputs.gaussians[0], gaussians.signals
     rows_of, sh = ((), ()) if tables is None else (inputs.gaussians, tables.parts)
     # Hooks on saved tensors (checkpointing) need the same shapes each time, without spare capacity.
@@ -165,9 +158,7 @@ def _render_queued(
         splats = projected.splats
         if tables is not None:
             tables.before(splats.visible_ids, projected.n_visible if has_spare else None)
-        channels = None
-        if not sh:
-            channels = splats.colors if only_colors else channels_of(splats, gaussians, image, not exact)
+        channels = None if sh else channels_of(splats, gaussians, image, not exact)
         outputs = torch.ops.blitzgs.render(
             splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids,
             splats.visible_ids, splats.splat_offsets, splats.radii, splats.tiles_touched,
@@ -188,56 +179,16 @@ def _render_queued(
         colors, numbers, ids, *found = of_rows
         splats = splats._replace(colors=colors, visible_ids=numbers)
         inputs = inputs._replace(gaussians=rows_of_tables([*rows_of, *sh], ids, image.sparse_grad, found))
-    has_blank_view = 0 in rest[VIEW_TOTALS - 3 :]
+    splats = differentiable_splats(inputs, image.sparse_grad and tables is None, splats)
     grid = TileGrid(inputs.n_views, options.width, options.height, options.tile_size)
-    return _Queued(splats, inputs, Lists(isect_splats, tile_offsets, grid), images, has_blank_view)
+    has_blank_view = 0 in rest[VIEW_TOTALS - 3 :]
+    return _Queued(splats, Lists(isect_splats, tile_offsets, grid), images, has_blank_view)
 
 
 @lru_cache(maxsize=16)
 def _transport(_device: torch.device, _gaussians: int, _views: int) -> LocalTransport:
     """Return the transport, with its estimate of sizes, of all calls of this size."""
     return LocalTransport()
-
-
-def _images_of_caller(
-    renders: Tensor,  # all channels, [I, H, W, channels]
-    alphas: Tensor,  # [I, H, W]
-    median: Tensor | None,  # median depths, [I, H, W, 1] or of M pixels [M, 1]
-    gaussians: Gaussians,
-    image: ImageOptions,
-    lead: tuple[int, ...],  # batch dimensions, and the number of views that are rendered here
-) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-    """Return images and alphas as the caller asked for them, and the further images of `meta` by key."""
-    alphas = alphas.unsqueeze(-1)
-    if image.pixels is not None:
-        renders, alphas = (t.flatten(0, 2).index_select(0, image.pixels.numbers) for t in (renders, alphas))
-    others: dict[str, Tensor] = {}
-    if gaussians.signals is not None or image.normals:
-        renders, others = split_channels(renders, gaussians, image)
-    if median is not None:
-        others["render_median"] = median
-    if image.render_mode.endswith("ED"):
-        # Autograd saves the divisor. It is a copy, so that the caller may change alphas in place.
-        covered = alphas.clone().clamp_(min=1e-10)
-        renders = torch.cat([renders[..., :-1], renders[..., -1:] / covered], dim=-1)
-    if len(lead) > 1 and image.pixels is None:
-        shape = (*lead, *renders.shape[1:3])
-        renders, alphas = renders.view(*shape, renders.shape[-1]), alphas.view(*shape, 1)
-        others = {key: values.view(*shape, values.shape[-1]) for key, values in others.items()}
-    return renders, alphas, others
-
-
-def _median_depths(splats: ProjectedSplats, lists: Lists, pixels: Pixels | None) -> Tensor:
-    """Return the depth of the splat at which half the light of each pixel is gone, [I, H, W, 1] or [M, 1]."""
-    n_cameras, width, height, tile_size, *_ = lists.grid
-    found = pixel_splats(
-        splats.means2d, splats.conics, splats.opacities, lists.splats, lists.offsets, n_cameras=n_cameras,
-        width=width, height=height, tile_size=tile_size, pixels=None if pixels is None else pixels.numbers,
-    )  # fmt: skip
-    # Before the first splat stands the depth of a pixel without splats.
-    table = torch.cat([splats.depths.new_zeros(1), splats.depths])
-    depths = table.index_select(0, found.medians + 1)
-    return depths.view(-1, 1) if pixels is not None else depths.view(n_cameras, height, width, 1)
 
 
 def _nan_or_zero(table: Tensor) -> Tensor:
@@ -272,7 +223,7 @@ def _without_non_finite(gaussians: Gaussians) -> tuple[Gaussians, list[Tensor]]:
     return gaussians._replace(scenes=scenes), nan_marks
 
 
-def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
+def _groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[_Group]:
     """Divide the views into groups; one scene of up to 32 views with common colours is one group."""
     groups = []
     sh_per_view = gaussians.per_view and gaussians.sh_degree is not None
@@ -284,28 +235,25 @@ def groups_of(gaussians: Gaussians, options: ProjectionOptions) -> list[Group]:
             views = list(zip(scene.viewmats.split(most), scene.Ks.split(most), strict=True))
         sh = _sh_of_views(gaussians, scene, len(views))
         for part, (viewmats, Ks) in enumerate(views):
-            own = gaussian_tensors(scene.means, scene.quats, scene.scales, scene.opacities, sh[part])
+            own = [scene.means, scene.quats, scene.scales, scene.opacities, *sh[part]]
             inputs = ProjectionInputs(own, (viewmats, Ks), options)
             lenses = scene.lenses and scene.lenses.rows(part * most, (part + 1) * most)
-            groups.append(Group(inputs, s * n_views + part * most, scene.covariances, lenses))
+            groups.append(_Group(inputs, s * n_views + part * most, scene.covariances, lenses))
     return groups
 
 
-def _sh_of_views(gaussians: Gaussians, scene: Scene, parts: int) -> Sequence[Tensor | None]:
-    """Return the SH that each part of a scene's views is rendered with."""
+def _sh_of_views(gaussians: Gaussians, scene: Scene, parts: int) -> list[list[Tensor]]:
+    """Return the SH that each part of a scene's views is rendered with; an empty list for none."""
     if gaussians.sh_degree is None or scene.colors is None:
-        return (None,) * parts
+        return [[]] * parts
     if not gaussians.per_view:
-        return (scene.colors,) * parts
+        return [[scene.colors]] * parts
     # Without views there is still one part, and the sum over no views is a zero for each coefficient.
-    return scene.colors.unbind(0) if scene.colors.shape[0] else (scene.colors.sum(dim=0),)
+    return [[sh] for sh in scene.colors.unbind(0)] if scene.colors.shape[0] else [[scene.colors.sum(dim=0)]]
 
 
-def gathered_groups(groups: Sequence[Group], sh: ShTables, sparse_grad: bool) -> list[Group]:
-    """Return groups of the Gaussians alone that a view of any group sees.
-
-    `groups`: of one scene, without SH. `sparse_grad`: whether the tables get sparse gradients.
-    """
+def _of_visible_rows(groups: Sequence[_Group], sh: ShTables, sparse_grad: bool) -> list[_Group]:
+    """Return groups, of one scene without SH, of the Gaussians alone that a view of any group sees."""
     tables = groups[0].inputs.gaussians
     with torch.no_grad():
         ids = torch.cat([project_splats(group.inputs).visible_ids for group in groups]).unique()
@@ -314,11 +262,13 @@ def gathered_groups(groups: Sequence[Group], sh: ShTables, sparse_grad: bool) ->
     return [group._replace(inputs=group.inputs._replace(gaussians=rows), ids=ids) for group in groups]
 
 
-def _project_groups(groups: Sequence[Group], sparse_grad: bool) -> ProjectedSplats:
+def _project_groups(groups: Sequence[_Group], sparse_grad: bool, tables: ShTables | None) -> ProjectedSplats:
     """Return the splats of all images, group by group; their camera_ids number all images of the call.
 
     Of several groups, visible_ids and splat_offsets have no meaning.
     """
+    if tables is not None:
+        groups = _of_visible_rows(groups, tables, sparse_grad)
     parts = []
     for group in groups:
         if group.lenses is not None:
@@ -336,9 +286,9 @@ def _project_groups(groups: Sequence[Group], sparse_grad: bool) -> ProjectedSpla
     return ProjectedSplats._make((*map(torch.cat, columns), torch.stack(counts).sum(dim=0)))
 
 
-def groups_may_be_queued(groups: Sequence[Group]) -> bool:
+def _may_be_queued(groups: Sequence[_Group]) -> bool:
     """Tell whether the work of a call may be queued before the host knows the number of splats."""
     if len(groups) > 1 or groups[0].covariances is not None or groups[0].lenses is not None:
         return False
     means, options = groups[0].inputs.gaussians[0], groups[0].inputs.options
-    return means.shape[0] > 0 and (not means.is_cuda or options.tile_size == CUDA_TILE_SIZE)
+    return means.shape[0] > 0 and (not means.is_cuda or options.tile_size == TILE_SIZE)

@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 from blitzgs.call.covariances import Decomposed, decompose, shaped_by
-from blitzgs.call.gaussians import l1_ssim
+from blitzgs.call.losses import l1_ssim
 from blitzgs.ops.derivatives import first_only, linear_map
 from blitzgs.ops.intersect import intersect
 from blitzgs.ops.knn_distances import knn_distances
-from blitzgs.ops.project import differentiable_splats, gaussian_tensors
+from blitzgs.ops.project import differentiable_splats
 from blitzgs.ops.projection_types import ProjectedSplats, ProjectionInputs, ProjectionOptions
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.util.rotations import quaternion_matrices
@@ -256,7 +256,7 @@ def _project(
         antialiased=bool(settings.antialiasing), raw=False,
     )  # fmt: skip
     cameras = (settings.viewmatrix.to(means).reshape(1, 4, 4).mT.contiguous(), K)
-    gaussians = gaussian_tensors(means, rotations, scales, opacities.reshape(-1), sh)
+    gaussians = [means, rotations, scales, opacities.reshape(-1), *([] if sh is None else [sh])]
     inputs = ProjectionInputs(gaussians, cameras, options)
     splats = differentiable_splats(inputs, sparse_grad=False)
     return splats if decomposed is None else shaped_by(splats, inputs, decomposed)

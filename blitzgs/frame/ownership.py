@@ -17,7 +17,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.frame.tiles import TileRanges
 from blitzgs.ops.exchange import divide_tiles, tile_costs
-from blitzgs.ops.intersect import tile_counts
+from blitzgs.ops.intersect import TILE_SIZE, tile_counts
 
 # Fixed cost of a tile, in units of one list entry: its pixels are written and compared with the photograph.
 # The sums of `divide_tiles` are exact from 8 on.
@@ -69,11 +69,11 @@ class TileOwners:
     def plan(self, step: int, keys: Sequence[Hashable], width: int, height: int, halo: int) -> TileRanges:
         """Divide the tiles of a later step as `divide` does; keep the division until `forget_before`."""
         if step in self._planned:
-            ranges = TileRanges(self._planned[step], len(keys), width, height, halo=halo)
+            ranges = TileRanges(self._planned[step], len(keys), width, height, halo)
             # The resolution of the step may have changed since, with the pace of the run.
             if ranges.bounds[-1] == len(keys) * ranges.tiles_per_view:
                 return ranges
-        ranges = self.divide(keys, width, height, halo=halo)
+        ranges = self.divide(keys, width, height, halo)
         self._planned[step] = ranges.bounds
         return ranges
 
@@ -122,18 +122,16 @@ class TileOwners:
             else:
                 self._delayed.append(measured)
 
-    def divide(
-        self, keys: Sequence[Hashable], width: int, height: int, tile_size: int = 16, halo: int = 0
-    ) -> TileRanges:
+    def divide(self, keys: Sequence[Hashable], width: int, height: int, halo: int = 0) -> TileRanges:
         """Divide the tiles of B views, named by keys, into ranges of equal cost to within one tile."""
-        tiles = math.prod(tile_counts(width, height, tile_size))
+        tiles = math.prod(tile_counts(width, height, TILE_SIZE))
         found = [self._costs.get(key) for key in keys]
         costs = [_UNKNOWN if cost is None or cost.tiles != tiles else cost.pieces for cost in found]
         # Views have costs in common: in oblique views the far (upper) tiles cost more than the near ones. A
         # view without a visit is therefore expected to cost what similar views do.
         similar = self._similar(tiles) if any(cost is _UNKNOWN for cost in costs) else ()
         bounds = divide_tiles(costs, similar, tiles, _grain(tiles), TILE_COST, self.ranks.world_size)
-        return TileRanges(bounds, len(keys), width, height, tile_size, halo)
+        return TileRanges(bounds, len(keys), width, height, halo)
 
     def record(
         self, keys: Sequence[Hashable], tile_work: Tensor, ranges: TileRanges, parts: Tensor | None = None

@@ -26,7 +26,7 @@ from blitzgs.frame.transport.protocol import (
     stage_ended,
 )
 from blitzgs.ops.blocks import ActiveRows
-from blitzgs.ops.intersect import TileGrid
+from blitzgs.ops.intersect import TILE_SIZE, TileGrid
 from blitzgs.ops.projection_types import (
     ProjectedSplats,
     ProjectionInputs,
@@ -49,7 +49,6 @@ class RenderOptions:
     eps2d: float = 0.3  # screen-space blur, pixels squared
     antialiased: bool = False  # compensate that blur in the opacities
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB behind everything
-    tile_size: int = 16  # pixels
     deterministic: bool = False  # gradients repeat bit for bit on CUDA too (they always do on the CPU)
     fade: tuple[float, ...] = ()  # `blitzgs.view.gate.LodGate.fade`; empty: opacities do not fade
 
@@ -63,7 +62,6 @@ class RenderOptions:
         return ProjectionOptions(
             width=views.width,
             height=views.height,
-            tile_size=self.tile_size,
             sh_degree=self.sh_degree,
             near_plane=self.near_plane,
             far_plane=self.far_plane,
@@ -88,6 +86,11 @@ class Frame(NamedTuple):
     tile_work: Tensor  # int32 [B * T], list entries each composited tile went through
     saved: RasterizeSaved  # the tensors that the backward pass of compositing reads
     gradients: GradientBuffer  # memory in which the gradients of the splats are summed
+
+    @property
+    def own_tiles(self) -> tuple[int, int]:
+        """The tiles whose loss this rank computes, [first, one past last); -1: all from the first on."""
+        return (0, -1) if self.assignment is None else self.assignment.own_tiles
 
     def over_own_background(self) -> Tensor:
         """Return the renders over the background of the options, if views had others, [B, H, W, 3]."""
@@ -130,7 +133,7 @@ def render_frame(
         ranks shared the work.
     """
     transport = transport or open_transport(None if assignment is None else assignment.ranks)
-    grid = tile_grid(views, options, assignment)
+    grid = tile_grid(views, assignment)
     if backgrounds is None:
         backgrounds = _backgrounds(options.background, len(views), views.viewmats.device)
 
@@ -203,15 +206,15 @@ def tile_lists(exchange: Exchange, grid: TileGrid) -> list[Tensor]:
     splats = exchange.arrived
     lists = torch.ops.blitzgs.intersect(
         splats.means2d, splats.conics, splats.opacities, splats.depths, splats.camera_ids, splats.ids,
-        *grid, exchange.n_isects, exchange.n_splats, True,
+        *grid, exchange.n_isects, exchange.n_splats, unchecked=True,
     )  # fmt: skip
     return list(lists)
 
 
-def tile_grid(views: Views, options: RenderOptions, assignment: TileAssignment | None) -> TileGrid:
+def tile_grid(views: Views, assignment: TileAssignment | None) -> TileGrid:
     """Return the grid of tiles, with the range of them that this rank composites."""
     tiles = (0, -1) if assignment is None else assignment.composited_tiles
-    return TileGrid(len(views), views.width, views.height, options.tile_size, *tiles)
+    return TileGrid(len(views), views.width, views.height, TILE_SIZE, *tiles)
 
 
 @lru_cache(maxsize=16)
@@ -227,8 +230,7 @@ def backward_splats(frame: Frame, v_renders: Tensor) -> SplatGradients:
     RuntimeError: the ranks share memory, and a later frame has overwritten this frame's splats.
     """
     views, options, way_back = frame.views, frame.options, frame.way_back
-    tiles = (0, -1) if frame.assignment is None else frame.assignment.own_tiles
-    grid = TileGrid(len(views), views.width, views.height, options.tile_size, *tiles)
+    grid = TileGrid(len(views), views.width, views.height, TILE_SIZE, *frame.own_tiles)
     if way_back is not None:
         way_back.check_still_valid()
     table = frame.gradients.take(frame.splats.means2d) if v_renders.is_cuda else None
@@ -312,7 +314,7 @@ def survey(
     """
     transport = transport or open_transport(None if assignment is None else assignment.ranks)
     inputs = inputs_of(table, views, options, active, colored=False)
-    grid = tile_grid(views, options, assignment)
+    grid = tile_grid(views, assignment)
 
     def attempt(capacity: Sizes | None) -> tuple[Exchange, tuple[Tensor, Tensor, Tensor]]:
         exchange = transport.project_and_send(inputs, assignment, capacity)

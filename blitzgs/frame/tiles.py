@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from blitzgs.ops.intersect import pixels_of_tiles, tile_counts
+from blitzgs.ops.intersect import TILE_SIZE, TileGrid, tile_counts
 
 if TYPE_CHECKING:
     from blitzgs.distributed.group import Ranks
@@ -31,7 +31,6 @@ class TileRanges:
     n_views: int  # B
     width: int  # image width in pixels
     height: int  # image height in pixels
-    tile_size: int = 16  # tile edge in pixels
     # A rank also composites the tiles within this many pixels of its own, which have the same bits on each.
     # With `LOSS_HALO` it can compute its loss without pixels of other ranks. 0: only its own tiles.
     halo: int = 0
@@ -39,12 +38,12 @@ class TileRanges:
     @cached_property
     def tiles_x(self) -> int:
         """Tiles in a row."""
-        return tile_counts(self.width, self.height, self.tile_size)[0]
+        return tile_counts(self.width, self.height, TILE_SIZE)[0]
 
     @cached_property
     def tiles_per_view(self) -> int:
         """Tiles of one view, T."""
-        return math.prod(tile_counts(self.width, self.height, self.tile_size))
+        return math.prod(tile_counts(self.width, self.height, TILE_SIZE))
 
     def of(self, rank: int) -> tuple[int, int]:
         """Return a rank's [first, one past last) tile."""
@@ -57,7 +56,7 @@ class TileRanges:
         for a rank without tiles. The first tiles ascend with the ranks.
         """
         begin, end = self.of(rank)
-        ring = -(-self.halo // self.tile_size)
+        ring = -(-self.halo // TILE_SIZE)
         stretch = ring * (self.tiles_x + 1) if ring else 0
         low = max(begin // self.tiles_per_view * self.tiles_per_view, begin - stretch)
         if begin == end:
@@ -66,7 +65,7 @@ class TileRanges:
 
     def pixel_mask(self, rank: int, device: torch.device) -> Tensor:
         """Mark the pixels of a rank's tiles, bool [B, H, W]."""
-        return pixels_of_tiles(self.n_views, self.width, self.height, self.tile_size, *self.of(rank), device)
+        return TileGrid(self.n_views, self.width, self.height, TILE_SIZE, *self.of(rank)).owned_pixels(device)
 
     def pixel_rows(self, rank: int) -> list[tuple[int, int]]:
         """Return the rows [y0, y1) of each view that the loss of a rank reads; (0, 0) without tiles."""
@@ -74,8 +73,8 @@ class TileRanges:
         rows = []
         for first in range(0, self.n_views * tiles_per_view, tiles_per_view):
             low, high = max(begin - first, 0), min(end - first, tiles_per_view)
-            y0 = low // tiles_x * self.tile_size - LOSS_HALO
-            y1 = ((high - 1) // tiles_x + 1) * self.tile_size + LOSS_HALO
+            y0 = low // tiles_x * TILE_SIZE - LOSS_HALO
+            y1 = ((high - 1) // tiles_x + 1) * TILE_SIZE + LOSS_HALO
             rows.append((max(y0, 0), min(y1, self.height)) if low < high else (0, 0))
         return rows
 
@@ -84,7 +83,6 @@ class TileAssignment:
     """The division of tiles among the ranks in one rendering; all ranks of the job render together."""
 
     def __init__(self, ranks: Ranks, ranges: TileRanges) -> None:
-        """Compute which tiles each rank composites."""
         self.ranks, self.ranges = ranks, ranges
         self.own_tiles = ranges.of(ranks.rank)  # [first, one past last)
         # What a rank composites: its own tiles and the halo around them, [first, one past last).
@@ -100,7 +98,7 @@ def collect_images(renders: Tensor, ranges: TileRanges, ranks: Ranks, destinatio
     owned = [ranges.of(rank) for rank in range(ranks.world_size)]
     outgoing = [] if here else [owned[ranks.rank]]
     incoming = [stretch for stretch, other in zip(owned, others, strict=True) if here and other]
-    pixels = [ranges.tile_size**2 * (end - begin) for begin, end in owned]
+    pixels = [TILE_SIZE**2 * (end - begin) for begin, end in owned]
     sent = [pixels[ranks.rank] * (not here and not other) for other in others]
     received = [n * (here and other) for n, other in zip(pixels, others, strict=True)]
     flat = renders.view(-1, renders.shape[-1])
@@ -113,8 +111,8 @@ def _pixels(stretches: list[tuple[int, int]], ranges: TileRanges, device: torch.
     parts = [torch.arange(low, high, device=device) for low, high in stretches]
     tiles = torch.cat(parts) if parts else torch.empty(0, dtype=torch.int64, device=device)
     view, tile = tiles // ranges.tiles_per_view, tiles % ranges.tiles_per_view
-    steps = torch.arange(ranges.tile_size, device=device)
-    y = (tile // ranges.tiles_x * ranges.tile_size)[:, None] + steps
-    x = (tile % ranges.tiles_x * ranges.tile_size)[:, None] + steps
+    steps = torch.arange(TILE_SIZE, device=device)
+    y = (tile // ranges.tiles_x * TILE_SIZE)[:, None] + steps
+    x = (tile % ranges.tiles_x * TILE_SIZE)[:, None] + steps
     rows = view[:, None] * ranges.height + y.clamp(max=ranges.height - 1)
     return (rows[:, :, None] * ranges.width + x.clamp(max=ranges.width - 1)[:, None, :]).flatten()

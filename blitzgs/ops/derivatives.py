@@ -61,8 +61,6 @@ def linear_map(
 
 
 class _LinearMap(torch.autograd.Function):
-    """See `linear_map`."""
-
     @staticmethod
     def forward(
         ctx: Any,

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs.ops.intersect import TILE_SIZE
 
 # Units of a weight in 1, kContributionScale of csrc/importance/importance.h. Sums of such integers depend on
 # no order of addition, and those of disjoint ranges of tiles add up.
@@ -83,7 +84,7 @@ def pixel_splats(
     n_cameras: int,
     width: int,
     height: int,
-    tile_size: int = 16,
+    tile_size: int = TILE_SIZE,
     strongest: int = 0,
     pixels: Tensor | None = None,
 ) -> PixelSplats:

@@ -11,6 +11,9 @@ from torch import Tensor
 import blitzgs._library  # noqa: F401  (registers the ops)
 from blitzgs.util.errors import check_tensors
 
+# Edge of a tile, pixels; CUDA composites tiles of no other.
+TILE_SIZE = 16
+
 
 class TileGrid(NamedTuple):
     """The tiles of B views, as the ops take them."""
@@ -18,7 +21,7 @@ class TileGrid(NamedTuple):
     n_cameras: int  # B
     width: int  # of every view, pixels
     height: int
-    tile_size: int = 16  # edge of a tile, pixels
+    tile_size: int = TILE_SIZE  # edge of a tile, pixels
     tile_begin: int = 0  # the range of tiles to composite
     tile_end: int = -1  # -1: all tiles
 
@@ -27,21 +30,19 @@ class TileGrid(NamedTuple):
         """(tiles_x, tiles_y), the tiles that cover a view."""
         return tile_counts(self.width, self.height, self.tile_size)
 
+    def owned_pixels(self, device: torch.device) -> Tensor:
+        """Mark the pixels of the tiles [tile_begin, tile_end), bool [B, H, W]."""
+        tiles_x, tiles_y = self.tiles
+        tiles = torch.arange(self.n_cameras * tiles_y * tiles_x, device=device)
+        end = len(tiles) if self.tile_end < 0 else self.tile_end
+        owned = ((tiles >= self.tile_begin) & (tiles < end)).view(self.n_cameras, tiles_y, tiles_x)
+        pixels = owned.repeat_interleave(self.tile_size, 1).repeat_interleave(self.tile_size, 2)
+        return pixels[:, : self.height, : self.width]
+
 
 def tile_counts(width: int, height: int, tile_size: int) -> tuple[int, int]:
     """Return (tiles_x, tiles_y), the tiles that cover an image of width x height pixels."""
     return -(-width // tile_size), -(-height // tile_size)
-
-
-def pixels_of_tiles(
-    n_cameras: int, width: int, height: int, tile_size: int, begin: int, end: int, device: torch.device
-) -> Tensor:
-    """Mark the pixels of the tiles [begin, end), bool [n_cameras, height, width]."""
-    tiles_x, tiles_y = tile_counts(width, height, tile_size)
-    tiles = torch.arange(n_cameras * tiles_y * tiles_x, device=device)
-    owned = ((tiles >= begin) & (tiles < end)).view(n_cameras, tiles_y, tiles_x)
-    pixels = owned.repeat_interleave(tile_size, 1).repeat_interleave(tile_size, 2)
-    return pixels[:, :height, :width]
 
 
 def intersect(
@@ -55,7 +56,7 @@ def intersect(
     n_cameras: int,
     width: int,
     height: int,
-    tile_size: int = 16,
+    tile_size: int = TILE_SIZE,
     tile_begin: int = 0,
     tile_end: int = -1,
     n_isects: int = -1,

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from blitzgs._library import below_autograd
 from blitzgs.ops.derivatives import first_only
+from blitzgs.ops.intersect import TILE_SIZE
 
 
 def photometric_loss(
@@ -53,7 +54,7 @@ def pixel_counts(renders: Tensor, masks: Tensor | None = None) -> Tensor:
 
 def photometric_sums(renders: Tensor, targets: Tensor, masks: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Return the sums of |x - y| and of the SSIM map of each view, [B] each, as for `photometric_loss`."""
-    return torch.ops.blitzgs.photometric_fwd(renders, targets, _as_bytes(masks), 16, 0, -1)
+    return torch.ops.blitzgs.photometric_fwd(renders, targets, _as_bytes(masks), TILE_SIZE, 0, -1)
 
 
 def photometric_fwd_bwd(
@@ -62,7 +63,7 @@ def photometric_fwd_bwd(
     masks: Tensor | None,
     l1_weights: Tensor,
     ssim_weights: Tensor,
-    tile_size: int = 16,
+    tile_size: int = TILE_SIZE,
     tile_begin: int = 0,
     tile_end: int = -1,
     *,

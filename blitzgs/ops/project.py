@@ -12,11 +12,13 @@ from torch import Tensor
 from blitzgs._library import below_autograd
 from blitzgs.ops.derivatives import first_only, full_gradients
 from blitzgs.ops.host import to_host
+from blitzgs.ops.intersect import TILE_SIZE
 from blitzgs.ops.projection_types import (
     N_OPTIONS,
     ProjectedSplats,
     ProjectionInputs,
     ProjectionOptions,
+    ProjectionOutputs,
     Sizes,
     splats_of,
 )
@@ -137,7 +139,7 @@ def project(
     *,
     active_ids: Tensor | None = None,
     active_views: Tensor | None = None,
-    tile_size: int = 16,
+    tile_size: int = TILE_SIZE,
     sh_degree: int = 0,
     near_plane: float = 0.01,
     far_plane: float = 1e10,
@@ -191,22 +193,32 @@ def project(
     options = ProjectionOptions(
         width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw
     )
-    gaussians = gaussian_tensors(means, quats, scales, opacities, sh)
+    gaussians = [means, quats, scales, opacities, *([] if sh is None else [sh])]
     inputs = ProjectionInputs(gaussians, (viewmats, Ks), options, (active_ids, active_views))
     return differentiable_splats(inputs, sparse_grad)
 
 
-def gaussian_tensors(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor | None
-) -> list[Tensor]:
-    """Return `ProjectionInputs.gaussians`."""
-    return [means, quats, scales, opacities, *([] if sh is None else [sh])]
+def queue_projection(
+    inputs: ProjectionInputs, capacity: Sizes | None, rank_tiles: Sequence[tuple[int, int]] = ()
+) -> ProjectionOutputs:
+    """Project as `project` does, with grouped arguments, without gradients.
+
+    `capacity`: numbers of visible Gaussians and splats to allocate; CUDA then does not wait for the true
+    numbers. None: wait, and allocate exactly as many as there are. `rank_tiles`: for each rank the [begin,
+    end) of the tiles that it composites, in ascending order.
+    """
+    room = (None, None) if capacity is None else capacity[:2]
+    *columns, splat_ids, totals = torch.ops.blitzgs.project_fwd(
+        inputs.gaussians, *inputs.cameras, *inputs.active_arguments, inputs.ids, inputs.level,
+        *inputs.options, [tile for tiles in rank_tiles for tile in tiles], *room,
+    )  # fmt: skip
+    return ProjectionOutputs(ProjectedSplats._make((*columns, None)), splat_ids, totals)
 
 
 def project_splats(inputs: ProjectionInputs) -> ProjectedSplats:
-    """Project as `project` does, with grouped arguments, without gradients. Wait for the number of splats."""
+    """Project as `queue_projection` does, and wait for the number of splats."""
     with below_autograd():
-        projected = inputs.project(None)
+        projected = queue_projection(inputs, None)
         return splats_of(projected.splats, Sizes(*to_host(projected.totals)[:3].tolist()))
 
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 import blitzgs._library  # noqa: F401  (registers the ops)
+from blitzgs.ops.intersect import TILE_SIZE
 
 # Largest number of views of one launch (kMaxViews of csrc/common/kernel.h): an int32 has a bit for each.
 MAX_VIEWS = 32
@@ -101,7 +102,7 @@ class ProjectionOptions(NamedTuple):
 
     width: int
     height: int
-    tile_size: int = 16
+    tile_size: int = TILE_SIZE
     sh_degree: int = 0
     near_plane: float = 0.01
     far_plane: float = 1e10
@@ -137,25 +138,9 @@ class ProjectionInputs(NamedTuple):
         """The four arguments of the op that tell which Gaussians to consider."""
         return (*self.active, *[None] * 4)[:4]
 
-    def project(
-        self, capacity: Sizes | None, rank_tiles: Sequence[tuple[int, int]] = ()
-    ) -> ProjectionOutputs:
-        """Project the Gaussians, without gradients.
-
-        `capacity`: numbers of visible Gaussians and splats to allocate; CUDA then does not wait for the true
-        numbers. None: wait, and allocate exactly as many as there are. `rank_tiles`: for each rank the
-        [begin, end) of the tiles that it composites, in ascending order.
-        """
-        room = (None, None) if capacity is None else capacity[:2]
-        *columns, splat_ids, totals = torch.ops.blitzgs.project_fwd(
-            self.gaussians, *self.cameras, *self.active_arguments, self.ids, self.level, *self.options,
-            [tile for tiles in rank_tiles for tile in tiles], *room,
-        )  # fmt: skip
-        return ProjectionOutputs(ProjectedSplats._make((*columns, None)), splat_ids, totals)
-
 
 class ProjectionOutputs(NamedTuple):
-    """What `ProjectionInputs.project` returns."""
+    """What `blitzgs.ops.project.queue_projection` returns."""
 
     # as long as the given capacity, if any, without `counts`; undefined if the capacity was too small
     splats: ProjectedSplats

@@ -7,7 +7,6 @@ Also the gradients of splats, in the two layouts in which compositing hands them
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -17,7 +16,7 @@ from torch import Tensor
 
 from blitzgs._library import below_autograd
 from blitzgs.ops.derivatives import first_only
-from blitzgs.ops.intersect import TileGrid, pixels_of_tiles
+from blitzgs.ops.intersect import TILE_SIZE, TileGrid
 from blitzgs.util.errors import check_tensors
 
 # Where the parts of a splat gradient begin in its floats (csrc/common/kernel.h), and how many these are.
@@ -54,7 +53,7 @@ def rasterize(
     n_cameras: int,
     width: int,
     height: int,
-    tile_size: int = 16,
+    tile_size: int = TILE_SIZE,
     backgrounds: Tensor | None = None,
     tile_begin: int = 0,
     tile_end: int = -1,
@@ -126,8 +125,7 @@ def rasterize(
         call = _Call(splats, grid, store_absgrad, arrange, backward_follows, composited)
         renders, alphas = _Rasterize.apply(*geometry, colors, backgrounds, call)  # type: ignore[no-untyped-call]
     if (tile_begin, tile_end) != (0, -1):
-        end = sys.maxsize if tile_end < 0 else tile_end
-        alphas = alphas * pixels_of_tiles(n_cameras, width, height, tile_size, tile_begin, end, alphas.device)
+        alphas = alphas * grid.owned_pixels(alphas.device)
     return renders, alphas
 
 
@@ -197,13 +195,13 @@ class SplatGradients(NamedTuple):
 class RasterizeSaved(NamedTuple):
     """What a forward pass saves for the ops of the backward pass, in the groups that these take."""
 
-    splats: list[Tensor]  # means2d [P, 2], conics [P, 3], splat_opacities [P], colors [P, D]
+    splats: Sequence[Tensor]  # means2d [P, 2], conics [P, 3], splat_opacities [P], colors [P, D]
     backgrounds: Tensor | None  # [B, D]; None: black
     # isect_splats, int32 [I], by tile, front to back; tile_offsets, int64 [B T + 1], where each begins
-    lists: list[Tensor]
+    lists: Sequence[Tensor]
     # transmittances [B, H, W]; last_ids, int32 [B, H, W], where each pixel's list ended; packed_splats and
     # tile_order, in layouts that only the kernels of the backend read.
-    composited: list[Tensor]
+    composited: Sequence[Tensor]
 
 
 @dataclass
@@ -243,16 +241,6 @@ def _save(ctx: Any, splats: Any, grid: Any, output: Sequence[Tensor]) -> None:
     ctx.grid = grid
 
 
-def _saved(ctx: Any) -> RasterizeSaved:
-    """Return the tensors that `_save` saved. Call this once: checkpointing recomputes them each time."""
-    means2d, conics, opacities, colors, backgrounds, isect_splats, tile_offsets, *composited = (
-        ctx.saved_tensors
-    )
-    return RasterizeSaved(
-        [means2d, conics, opacities, colors], backgrounds, [isect_splats, tile_offsets], composited
-    )
-
-
 def _backward(
     ctx: Any, v_renders: Tensor | None, v_transmittances: Tensor | None, *_: Tensor | None
 ) -> tuple[Tensor | None, ...]:
@@ -272,7 +260,8 @@ def _gradients(
     """
     if v_renders is None and v_alphas is None:
         return (None,) * 6
-    saved = _saved(ctx)
+    tensors = ctx.saved_tensors  # read once: checkpointing recomputes them at each reading
+    saved = RasterizeSaved(tensors[:4], tensors[4], tensors[5:7], tensors[7:])
 
     def compute() -> Sequence[Tensor | None]:
         (means2d, _, _, colors), (transmittances, *_) = saved.splats, saved.composited

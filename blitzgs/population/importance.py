@@ -125,7 +125,7 @@ def _assign(batch: ViewBatch, options: RenderOptions, owners: TileOwners) -> Til
     if owners.ranks.world_size == 1:
         return None
     views, keys = batch.views, batch.columns if batch.keys is None else batch.keys
-    ranges = owners.divide(list(keys), views.width, views.height, options.tile_size)
+    ranges = owners.divide(list(keys), views.width, views.height)
     return TileAssignment(owners.ranks, ranges)
 
 

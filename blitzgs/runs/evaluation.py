@@ -112,7 +112,7 @@ def render_view(
     try:
         if ranks.world_size == 1:
             return render_frame(table, picked, options, active).renders[0]
-        ranges = owners.divide([index], picked.width, picked.height, options.tile_size)
+        ranges = owners.divide([index], picked.width, picked.height)
         frame = render_frame(table, picked, options, active, TileAssignment(ranks, ranges))
     except (RuntimeError, MemoryError) as error:
         explain_memory(error, 1, picked.width, picked.height, len(table), ranks.device)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.frame.tiles import LOSS_HALO
+from blitzgs.ops.intersect import TILE_SIZE
 from blitzgs.ops.photometric import photometric_fwd_bwd
 
 if TYPE_CHECKING:
@@ -69,8 +70,8 @@ def loss_terms(
         batch.targets,
         batch.masks,
         *_weights(config.ssim, count, batch.samples.device),
-        frame.options.tile_size,
-        *((0, -1) if assignment is None else assignment.own_tiles),
+        TILE_SIZE,
+        *frame.own_tiles,
         samples=batch.samples,
         visible=frame.visible,
         scale_weight=config.scale / (extent * SCALE_UNIT * count),

@@ -119,7 +119,7 @@ def set_up(
     owners = TileOwners(ranks)
     if "bounds" in shared and ranks.world_size > 1:
         owners.restore(shared)
-    views = ViewSet(list(capture.cameras), space, ranks.device)
+    views = ViewSet(capture.cameras, space, ranks.device)
     sampler = _sampler(config, capture, schedule)
     if config.memory.resident_gb > 0:
         if restored is not None and restored.config.memory.resident_gb == 0:

@@ -108,8 +108,10 @@ class Stepper:
                 gate_views_(rows, table["means"], views.viewmats, rules)
             return rows
 
-        way = assignment, self._transport
-        frame = render_frame(table, views, options, active, *way, True, batch.backgrounds)
+        frame = render_frame(
+            table, views, options, active, assignment, self._transport,
+            backward_follows=True, backgrounds=batch.backgrounds,
+        )  # fmt: skip
         if self.exposures is None:
             terms = loss_terms(frame, batch, self._loss, self._extent)
         else:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from blitzgs.formats.gaussians import SH_C0
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.frame.render import Frame, RenderOptions, render_frame
+from blitzgs.frame.render import Frame, RenderOptions, render_frame, tile_grid
 from blitzgs.frame.tiles import TileAssignment, collect_images
 from blitzgs.frame.transport.protocol import LocalTransport
 from blitzgs.ops.blocks import BLOCK_ROWS, ActiveRows
@@ -75,7 +75,7 @@ class Drawer:
         ranges = assignment = None
         if ranks.world_size > 1:
             self._together(lambda: _reserve(subject.gaussians, look, device))
-            ranges = self._owners.divide([None], look.width, look.height, options.tile_size)
+            ranges = self._owners.divide([None], look.width, look.height)
             assignment = TileAssignment(ranks, ranges)
         depths = [options.near_plane, options.far_plane]
         if assignment is None and self._in_layers:
@@ -219,12 +219,10 @@ def _channels(frame: Frame, mode: Mode) -> Tensor:
         return last_ids[..., None].float()
     if mode != "depth":
         return frame.renders
-    splats, views = frame.splats, frame.views
-    tiles = (0, -1) if frame.assignment is None else frame.assignment.composited_tiles
+    splats, grid = frame.splats, tile_grid(frame.views, frame.assignment)
     depth, _ = rasterize(
         splats.means2d, splats.conics, splats.opacities, splats.depths[:, None], *frame.saved.lists,
-        n_cameras=1, width=views.width, height=views.height, tile_size=frame.options.tile_size,
-        tile_begin=tiles[0], tile_end=tiles[1],
+        **grid._asdict(),
     )  # fmt: skip
     return depth
 

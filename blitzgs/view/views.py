@@ -94,7 +94,7 @@ def unpack_views(numbers: Tensor, width: int, height: int) -> Views:
 class ViewSet:
     """The cameras of a capture, from which batches of views are made."""
 
-    def __init__(self, cameras: list[CameraLike], space: Space, device: torch.device) -> None:
+    def __init__(self, cameras: Sequence[CameraLike], space: Space, device: torch.device) -> None:
         """Transform all poses into the trained world; `device` is the device of the views of `pick`."""
         poses = np.stack([viewmat(camera, space) for camera in cameras])
         self._viewmats = poses.astype(np.float32)
@@ -157,7 +157,7 @@ def render_options(config: Config, space: Space, sh_degree: int, lod: LodGate | 
     )
 
 
-def trained_centres(cameras: list[CameraLike], space: Space) -> Tensor:
+def trained_centres(cameras: Sequence[CameraLike], space: Space) -> Tensor:
     """Return the positions of cameras in the trained world, float64 [V, 3]."""
     return torch.from_numpy(camera_centres(np.stack([viewmat(camera, space) for camera in cameras])))
 

@@ -78,7 +78,7 @@ def test_leading_dimensions_and_floating_targets():
 
 def test_the_first_photographs_that_are_no_shares_are_named(monkeypatch):
     renders, targets, _ = images("cpu", torch.float64, 2, 2)
-    monkeypatch.setattr("blitzgs.call.gaussians._float_calls", count())
+    monkeypatch.setattr("blitzgs.call.losses._float_calls", count())
     with pytest.warns(UserWarning, match=r"targets go to 25\d: they are uint8, or floats from 0 to 1"):
         blitzgs.l1_ssim(renders, targets.double())
     with warnings.catch_warnings():

@@ -13,6 +13,7 @@ from blitzgs.frame.transport.protocol import Traffic
 from blitzgs.ops.exchange import PLACE_SPLATS
 from blitzgs.ops.host import HostCopy, PinnedNumbers, current_stream
 from blitzgs.ops.photometric import photometric_fwd_bwd
+from blitzgs.ops.project import queue_projection
 from blitzgs.ops.projection_types import VIEW_TOTALS, Sizes, splats_of
 from blitzgs.ops.rasterize import SPLAT_GRADIENT
 from tests.cuda.conftest import Scene, ops
@@ -137,11 +138,11 @@ class Rank:
         self.number = number
         ids = (torch.arange(n, device="cuda") * 7919 + number) % 100_003
         self.inputs = scene.inputs("cuda")._replace(ids=ids)
-        self.projected = self.inputs.project(None, RANGES)
+        self.projected = queue_projection(self.inputs, None, RANGES)
         self.totals = self.projected.totals
 
     def send(self, everyone, buffers, capacity):
-        projected = self.inputs.project(Sizes(capacity, capacity, 0), RANGES)
+        projected = queue_projection(self.inputs, Sizes(capacity, capacity, 0), RANGES)
         splats, _, totals = projected
         assert torch.equal(totals, self.totals)
         places, plan = ops.send_splats_(
@@ -219,7 +220,7 @@ def test_nothing_is_written_where_room_is_too_small(counts):
 
 def test_send_refuses_columns_below_the_capacity():
     rank = Rank(0, 100)
-    projected = rank.inputs.project(Sizes(64, 63, 0), RANGES)
+    projected = queue_projection(rank.inputs, Sizes(64, 63, 0), RANGES)
     with pytest.raises(RuntimeError, match="columns must have room for 64 splats, got 63"):
         ops.send_splats_(
             list(projected.for_compositing), projected.splats.rank_masks, rank.totals[None], 0,

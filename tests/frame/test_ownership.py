@@ -9,6 +9,7 @@ from blitzgs.distributed.group import Ranks
 from blitzgs.distributed.host_sum import HostSum
 from blitzgs.frame.ownership import TILE_COST, TileOwners
 from blitzgs.frame.tiles import LOSS_HALO, TileRanges
+from blitzgs.ops.intersect import TILE_SIZE
 
 
 class FirstRank(Ranks):
@@ -116,29 +117,27 @@ def test_pixel_rows_and_composited_tiles():
     assert ranges.pixel_rows(1) == [(0, 0), (0, 0)]
 
 
-@pytest.mark.parametrize("tile_size", [4, 8, 16])
+@pytest.mark.parametrize("halo", [LOSS_HALO, 16, 40])
 @pytest.mark.parametrize("bounds", [(0, 0, 1), (0.1, 0.35, 0.35, 0.7), (0.24, 0.25, 0.26, 0.5, 0.98, 1)])
-def test_composited_tiles_cover_the_halo_of_the_loss(tile_size, bounds):
-    """A rank composites every pixel within 10 pixels of an owned one, and few others."""
-    n_views, width, height = 3, 71, 50
-    per_view = -(-width // tile_size) * -(-height // tile_size)
+def test_composited_tiles_cover_the_halo(halo, bounds):
+    """A rank composites every pixel within `halo` pixels of an owned one, and few others."""
+    n_views, width, height = 3, 284, 200
+    per_view = -(-width // TILE_SIZE) * -(-height // TILE_SIZE)
     cuts = (0, *(round(n_views * per_view * at) for at in bounds), n_views * per_view)
-    ranges = TileRanges(cuts, n_views, width, height, tile_size, LOSS_HALO)
+    ranges = TileRanges(cuts, n_views, width, height, halo)
     firsts = [ranges.composited(rank)[0] for rank in range(len(cuts) - 1)]
     assert firsts == sorted(firsts)
     for rank in range(len(cuts) - 1):
         begin, end = ranges.composited(rank)
         owned = ranges.pixel_mask(rank, torch.device("cpu"))
-        there = TileRanges((0, begin, end), n_views, width, height, tile_size).pixel_mask(
-            1, torch.device("cpu")
-        )
-        near = torch.nn.functional.max_pool2d(owned[:, None].float(), 21, 1, 10)[:, 0] > 0
+        there = TileRanges((0, begin, end), n_views, width, height).pixel_mask(1, torch.device("cpu"))
+        near = torch.nn.functional.max_pool2d(owned[:, None].float(), 2 * halo + 1, 1, halo)[:, 0] > 0
         assert not (near & ~there).any()
         low, high = ranges.of(rank)
         if low == high:
             assert begin == end
             continue
-        ring = -(-LOSS_HALO // tile_size)
+        ring = -(-halo // TILE_SIZE)
         assert low - begin <= ring * (ranges.tiles_x + 1) and end - high <= ring * (ranges.tiles_x + 1)
         # A rank composites nothing in a view in which it owns nothing.
         views_owned = owned.flatten(1).any(1)

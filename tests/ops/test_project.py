@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from blitzgs.ops.intersect import intersect
-from blitzgs.ops.project import project
+from blitzgs.ops.project import project, queue_projection
 from blitzgs.ops.projection_types import (
     VIEW_TOTALS,
     ProjectionInputs,
@@ -212,7 +212,7 @@ def test_each_splat_knows_the_ranks_that_composite_its_tiles():
     scene = random_scene(n=500, cameras=2, width=70, height=40)  # 5 x 3 tiles a view
     ranges = [(0, 18), (12, 12), (12, 30)]
     inputs = inputs_of(scene)
-    splats, ids, totals = inputs._replace(ids=torch.arange(500) + 7).project(None, ranges)
+    splats, ids, totals = queue_projection(inputs._replace(ids=torch.arange(500) + 7), None, ranges)
     assert torch.equal(ids, splats.gaussian_ids + 7)
     masks = torch.zeros_like(splats.rank_masks)
     for rank, (begin, end) in enumerate(ranges):
@@ -231,7 +231,7 @@ def test_each_splat_knows_the_ranks_that_composite_its_tiles():
 def test_all_columns_that_are_sent_have_the_room_that_was_asked_for(n, device):
     scene = random_scene(n=n, cameras=2, device=device)
     inputs = inputs_of(scene)._replace(ids=torch.arange(n, device=device))
-    projected = inputs.project(Sizes(64, 64, 0), [(0, 4), (4, 9)])
+    projected = queue_projection(inputs, Sizes(64, 64, 0), [(0, 4), (4, 9)])
     room = 64 if device == "cuda" else int(projected.n_splats)
     assert {len(column) for column in (*projected.for_compositing, projected.splats.rank_masks)} == {room}
 
@@ -317,8 +317,10 @@ def test_groups_of_arguments_are_checked():
         ({"active": (None, torch.arange(2, dtype=torch.int32))}, "active_views, .* need active_ids"),
         ({"ids": torch.arange(3)}, r"ids must have shape \[4\], got \[3\]"),
     ):
-        refused(RuntimeError, text, inputs._replace(**change).project, None)
-    refused(RuntimeError, "a begin .* at most 63 ranks, got 128", inputs.project, None, [(0, 1)] * 64)
+        refused(RuntimeError, text, queue_projection, inputs._replace(**change), None)
+    refused(
+        RuntimeError, "a begin .* at most 63 ranks, got 128", queue_projection, inputs, None, [(0, 1)] * 64
+    )
 
 
 def test_compiles_into_one_graph_with_the_same_gradients():

@@ -8,7 +8,7 @@ import torch
 from blitzgs.ops.exchange import divide_tiles, tile_costs
 from blitzgs.ops.importance import pixel_splats
 from blitzgs.ops.intersect import TileGrid
-from blitzgs.ops.project import project_splats
+from blitzgs.ops.project import project_splats, queue_projection
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Sizes, splats_of
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.reference.render import composited_weights, median_splats, strongest_splats
@@ -92,9 +92,9 @@ def test_images_are_those_of_lists_and_compositing(backend, with_depth):
 def test_spare_capacity_changes_nothing(cameras, spare):
     tables, sh = tables_of("cuda", cameras=cameras)
     expected = project_splats(with_sh(tables, sh))
-    sizes = tables.project(None).totals.cpu()[:3]
+    sizes = queue_projection(tables, None).totals.cpu()[:3]
     capacity = Sizes(*(int(n) + spare for n in sizes))
-    projected = tables.project(capacity)
+    projected = queue_projection(tables, capacity)
     found, (rows, *_) = colored_rows(projected.splats, tables, (sh,), projected.totals)
     require_equal(splats_of(found, Sizes(*sizes.tolist())), expected)
     visible = expected.visible_ids.long()
@@ -105,8 +105,8 @@ def test_spare_capacity_changes_nothing(cameras, spare):
 @pytest.mark.parametrize("missing", [(1, 0), (0, 1), (10, 10)])
 def test_too_little_capacity_writes_nothing_beyond_it(missing):
     tables, sh = tables_of("cuda")
-    visible, splats, isects = tables.project(None).totals.cpu()[:3].tolist()
-    projected = tables.project(Sizes(visible - missing[0], splats - missing[1], isects))
+    visible, splats, isects = queue_projection(tables, None).totals.cpu()[:3].tolist()
+    projected = queue_projection(tables, Sizes(visible - missing[0], splats - missing[1], isects))
     colored_rows(projected.splats, tables, (sh,), projected.totals)
     torch.cuda.synchronize()
     assert projected.totals[:2].tolist() == [visible, splats]

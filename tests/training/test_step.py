@@ -301,7 +301,7 @@ def measure_with(ranks):
     generator = torch.Generator().manual_seed(1)
     renders = torch.rand(2, 64, 96, 3, generator=generator)
     targets = (renders * 200).byte()
-    ranges = TileOwners(ranks).divide([0, 1], 96, 64, 16) if ranks.world_size > 1 else None
+    ranges = TileOwners(ranks).divide([0, 1], 96, 64) if ranks.world_size > 1 else None
     exposures = Exposures([0, 1], ranks)
     exposures.measure(4, renders, SimpleNamespace(indices=[1, 0], targets=targets, masks=None, ranges=ranges))
     return exposures.columns()["exposures"]

@@ -309,7 +309,7 @@ def _gated_image(ranks):
         if ranks.world_size == 1:
             images.append(render_frame(table, views, options, active).renders.cpu())
             continue
-        ranges = owners.divide(range(4), WIDTH, HEIGHT, OPTIONS.tile_size)
+        ranges = owners.divide(range(4), WIDTH, HEIGHT)
         frame = render_frame(table, views, options, active, TileAssignment(ranks, ranges))
         own = ranges.pixel_mask(ranks.rank, ranks.device)
         images.append(torch.where(own[..., None], frame.renders, 0.0).cpu())

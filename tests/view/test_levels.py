@@ -10,7 +10,7 @@ import torch
 
 from blitzgs.distributed.group import Ranks
 from blitzgs.frame.render import render_frame
-from blitzgs.ops.project import differentiable_splats, gaussian_tensors, project
+from blitzgs.ops.project import differentiable_splats, project, queue_projection
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Views
 from blitzgs.reference.render import render as reference_render
 from blitzgs.view.gate import LodGate, ModelGate, centres_of
@@ -216,7 +216,7 @@ def test_gradients_are_those_of_opacities_that_faded_before(device, antialiased)
 
     first = [leaf.clone().requires_grad_() for leaf in (*leaves, viewmats)]
     options = ProjectionOptions(WIDTH, HEIGHT, fade=SMOOTH.fade(), **flags)
-    inputs = ProjectionInputs(gaussian_tensors(*first[:5]), (first[5], Ks), options, level=table["level"])
+    inputs = ProjectionInputs(first[:5], (first[5], Ks), options, level=table["level"])
     splats = differentiable_splats(inputs, False)
     v = weights_of(splats)
     found = torch.autograd.grad(columns(splats), first, v)
@@ -245,11 +245,10 @@ def test_gradients_are_those_of_opacities_that_faded_before(device, antialiased)
 def test_errors_name_the_value():
     table = faint_scene(13)
     viewmats, Ks = make_views(1)
-    gaussians = gaussian_tensors(*table.parameters)
 
     def call(level, fade):
         options = ProjectionOptions(WIDTH, HEIGHT, fade=fade)
-        ProjectionInputs(gaussians, (viewmats, Ks), options, level=level).project(None)
+        queue_projection(ProjectionInputs(table.parameters, (viewmats, Ks), options, level=level), None)
 
     refused(RuntimeError, "project_fwd: levels need a fade_slope of at least 1", call, table["level"], ())
     refused(RuntimeError, r"level must have shape \[10\], got \[9\]", call, table["level"][1:], SMOOTH.fade())

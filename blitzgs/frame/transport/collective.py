@@ -17,6 +17,7 @@ from blitzgs.frame.transport.protocol import (
 )
 from blitzgs.ops.exchange import gather_splats, scatter_splats, words_per_splat
 from blitzgs.ops.host import to_host
+from blitzgs.ops.project import queue_projection
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats
 
 
@@ -30,7 +31,6 @@ class CollectiveTransport:
     """
 
     def __init__(self, ranks: Ranks) -> None:
-        """Send splats between `ranks`."""
         self.estimate = CapacityEstimate()
         self._ranks = ranks
 
@@ -43,7 +43,7 @@ class CollectiveTransport:
         ranks, tiles, n_views = self._ranks, assignment.composited_by_rank, assignment.ranges.n_views
         # Without capacity the projection waits for the device, which may still wait for other ranks.
         with ranks.watchdog.waiting("project"):
-            projected = inputs.project(capacity, tiles)
+            projected = queue_projection(inputs, capacity, tiles)
         everyone = projected.totals.repeat(ranks.world_size, 1)
         # Newer versions of torch have this function under another name and warn about the old one.
         gather = getattr(dist, "all_gather_single", dist.all_gather_into_tensor)
@@ -55,7 +55,7 @@ class CollectiveTransport:
         traffic = Traffic.of(totals, n_views, ranks.rank)
         needed = traffic.own._replace(blocks=traffic.most_blocks)
         if capacity is not None and not capacity.holds(needed[:2]):
-            projected = inputs.project(None, tiles)  # no queued work waits for another rank now
+            projected = queue_projection(inputs, None, tiles)  # no queued work waits for another rank now
         stage_ended("project")
         projected = projected.first(needed)
         own, sent = projected.splats, projected.for_compositing

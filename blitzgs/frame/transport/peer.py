@@ -58,6 +58,7 @@ from blitzgs.frame.transport.protocol import (
 )
 from blitzgs.ops.exchange import PLACE_SPLATS
 from blitzgs.ops.host import current_stream
+from blitzgs.ops.project import queue_projection
 from blitzgs.ops.projection_types import VIEW_TOTALS, ProjectionInputs, Sizes, Splats, splats_of
 from blitzgs.ops.rasterize import SPLAT_GRADIENT, SplatGradients
 
@@ -88,8 +89,7 @@ class PeerBuffers:
     """The parts of the buffers of all ranks."""
 
     def __init__(self, buffers: Sequence[Tensor], rank: int) -> None:
-        """Divide buffers of equal length."""
-        self.buffers = list(buffers)  # int32 [words] of each rank, mapped here
+        self.buffers = list(buffers)  # int32 [words] of each rank, of equal length, mapped here
         # Capacity of each buffer, in splats.
         self.length = len(buffers[0]) // WORDS_PER_SPLAT // _ALIGNMENT * _ALIGNMENT
         columns, begin = [], 0
@@ -136,7 +136,7 @@ class PeerTransport:
             self._buffers = PeerBuffers(memory.buffers, ranks.rank)
         buffers = self._buffers
         room = Sizes(buffers.length, buffers.length, 0)
-        projected = inputs.project(room, assignment.composited_by_rank)
+        projected = queue_projection(inputs, room, assignment.composited_by_rank)
         shared = memory.share(projected.totals)  # barrier A
         counted.record(current_stream(ranks.device))
         places, plan = torch.ops.blitzgs.send_splats_(

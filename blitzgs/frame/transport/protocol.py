@@ -28,6 +28,7 @@ from torch import Tensor
 
 from blitzgs.ops.exchange import PLACE_SPLATS
 from blitzgs.ops.host import HostCopy
+from blitzgs.ops.project import queue_projection
 from blitzgs.ops.projection_types import (
     VIEW_TOTALS,
     ProjectedSplats,
@@ -236,7 +237,7 @@ class LocalTransport:
             raise ValueError("a local transport serves one rank, which composites all tiles")
         if not inputs.gaussians[0].is_cuda:
             capacity = None  # on the CPU the sizes are known at once
-        projected = inputs.project(capacity)
+        projected = queue_projection(inputs, capacity)
         splats, copy = projected.for_compositing, HostCopy(projected.totals)
         stage_ended("project")
         known: list[int] = [] if capacity is not None else copy.read().tolist()

@@ -60,11 +60,19 @@ def run_importance_pass(state: TrainingState, event: Event) -> None:
 
 
 def _surveyed(state: TrainingState, views: int) -> Importance:
-    subject, rule = state.subject(), state.config.population.score
+    subject = state.subject()
     with state.log.work("views surveyed") as report:
-        batches = _reported(view_batches(state), report, views)
-        asked = subject.options, state.ranks, state.owners, rule, subject.lod, state.stops
-        return sweep(subject.gaussians, batches, views, *asked)
+        return sweep(
+            subject.gaussians,
+            _reported(view_batches(state), report, views),
+            views,
+            subject.options,
+            state.ranks,
+            owners=state.owners,
+            rule=state.config.population.score,
+            lod=subject.lod,
+            stops=state.stops,
+        )
 
 
 def _described(state: TrainingState, event: Event, before: int, after: int) -> str | None:
@@ -131,8 +139,11 @@ def causes_of_death(state: TrainingState, event: Event, found: Importance) -> Te
     if _keeps_all(state, event):
         return causes
     if event.kind == "pass_1":
-        draw = state.config.seed, event.time, state.ranks
-        causes[~sample_by_score(found.score, ids, population.pass1_keep, *draw)] = Cause.PASS_1
+        kept = sample_by_score(
+            found.score, ids, population.pass1_keep, seed=state.config.seed, event=event.time,
+            ranks=state.ranks,
+        )  # fmt: skip
+        causes[~kept] = Cause.PASS_1
         return causes
     # If no Gaussian contributes to any view, the total is zero and no share of it can be kept.
     if state.ranks.all_reduce(found.score.double().sum()).item() > 0:
