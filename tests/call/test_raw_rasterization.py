@@ -226,6 +226,23 @@ def test_what_only_rasterization_or_gsplat_supports_is_refused(option):
         raw(raw_parameters(scene), scene, packd=value)
 
 
+@pytest.mark.parametrize("others", [{}, {"sh0": lambda t: t.squeeze(1), "means": lambda t: t}], ids=len)
+def test_rows_catch_up_behind_what_shares_their_memory(device, others):
+    """As in an evaluation of detached parameters, or of views of them."""
+    scene = spread(random_scene(n=60, device=device))
+    p = raw_parameters(scene)
+    optimizer = LazyAdam(p.values(), lr=0.1)
+    for number in (0, 0, 1):  # the view of the last step sees other Gaussians
+        raw(p, scene.view(number), optimizers=optimizer)[0].square().sum().backward()
+        optimizer.step()
+        optimizer.zero_grad()
+    with torch.no_grad():
+        shared = {name: others.get(name, torch.Tensor.detach)(t) for name, t in p.items()}
+        image = raw(shared, scene, optimizers=optimizer)[0]
+        optimizer.catch_up()
+        assert torch.equal(image, raw(p, scene)[0])
+
+
 def test_optimizers_may_be_one_of_any_class():
     scene = random_scene(n=20)
     p = raw_parameters(scene)
