@@ -6,7 +6,8 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -229,6 +230,18 @@ def on_threads(call: Callable[[], Any], counts: Iterable[int] = (1, 2, 3)) -> li
     finally:
         torch.set_num_threads(before)
     return results
+
+
+@contextmanager
+def other_defaults() -> Iterator[None]:
+    """Give torch another default dtype and device, on which what names none of its own cannot be used."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        with torch.device("meta"):
+            yield
+    finally:
+        torch.set_default_dtype(before)
 
 
 def refused(error: type[Exception], text: str, call: Callable, /, *given: Any, **named: Any) -> None:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 
 from blitzgs.call.arguments import MAX_CHANNELS, Gaussians, Signals, check_choice, refuse_shape
 from blitzgs.call.covariances import decompose
@@ -102,6 +103,9 @@ def with_lenses(
     lead, first = gaussians.lead, gaussians.scenes[0].viewmats
     compiled = {"torch.compile": torch.compiler.is_compiling()}
     learned = {"a gradient of viewmats": torch.is_grad_enabled() and first.requires_grad}
+    # Torch would drop them without a word.
+    tensors = (t for scene in gaussians.scenes for t in scene if isinstance(t, Tensor))
+    learned["forward-mode derivatives"] = any(unpack_dual(t).tangent is not None for t in tensors)
     for name, is_given in {**refused, **compiled, **learned}.items():
         if is_given:
             raise ValueError(f"with_ut does not support {name}; leave one of them out")

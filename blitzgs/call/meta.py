@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -29,7 +30,10 @@ _NOTHING_KNOWN = dict.fromkeys((*_KEYS, "non_finite"), LATER)
 
 
 class LazyDict(dict[str, Any]):
-    """A dict with values that are computed when they are first read; copies and pickles are plain dicts."""
+    """A dict with values that are computed when they are first read.
+
+    The modules `copy` and `pickle` make OrderedDicts of it, which `torch.load` reads by default.
+    """
 
     def __init__(self, given: Mapping[str, Any], compute: Callable[[str], Any]) -> None:
         """Begin with values by key; `LATER` for one that `compute` returns, given the key."""
@@ -78,11 +82,11 @@ class LazyDict(dict[str, Any]):
         return repr(dict(self))
 
     def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
-        return dict, (dict(self),)
+        return OrderedDict, (), None, None, iter(self.items())
 
 
 class LateMapping(Mapping[str, Any]):
-    """A mapping whose keys and values are computed when it is first looked into; copies are plain dicts."""
+    """A mapping whose keys and values are computed when it is first looked into; copied as `LazyDict` is."""
 
     def __init__(self, compute: Callable[[], Mapping[str, Any]]) -> None:
         self._compute = compute
@@ -104,7 +108,7 @@ class LateMapping(Mapping[str, Any]):
         return repr(dict(self))
 
     def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
-        return dict, (dict(self),)
+        return OrderedDict, (), None, None, iter(self.items())
 
 
 # Register the classes, so that tree_map visits their values: unregistered, they would be leaves.

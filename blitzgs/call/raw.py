@@ -79,7 +79,8 @@ def raw_rasterization(
             optimisers, gradient clipping and torch's DistributedDataParallel, which take no others.
         optimizers: the parameters' optimisers: one, a mapping or a sequence. Each `blitzgs.optim.LazyAdam`
             among them catches up the rows that this call reads: the geometry of all Gaussians, and the SH of
-            the visible ones.
+            the visible ones. Before other tensors are made of its parameters (`means + offsets`), call its
+            `catch_up`; views and detached parameters share their memory, and need no call.
         further: gsplat's other arguments; only those values are accepted that do not change the result
             (`packed=True`, `distributed=False`, `camera_model="pinhole"`, `covars=None`, ...).
 
@@ -115,8 +116,8 @@ def raw_rasterization(
     sh_params = {"sh0": sh0} if shN is None else {"sh0": sh0, "shN": shN}
     harmonics = list(sh_params.values())
     lazy = _lazy(optimizers)
-    for optimizer in lazy:  # before views of the parameters are made, which would be out of date
-        optimizer.catch_up(params.values())
+    if lazy:  # before views of the parameters are made, which would be out of date
+        _catch_up(lazy, params.values(), harmonics)
     if opacities.dim() == 2 and opacities.shape[1] == 1:
         tensors["opacities"] = opacities = of_shape(opacities, opacities.shape[:1])
     if sh0.dim() == 2 and sh0.shape[1] == 3:
@@ -150,6 +151,17 @@ def _defaults() -> dict[str, Any]:
     parameters = inspect.signature(rasterization).parameters.values()
     given = {p.name: p.default for p in parameters if p.default is not p.empty}
     return {**GSPLAT_DEFAULTS, **given, "channel_chunk": ANY, "segmented": ANY}
+
+
+def _catch_up(lazy: Iterable[Any], geometry: Iterable[Tensor], sh: Iterable[Tensor]) -> None:
+    """Catch up the geometry, and whole parameters of which a tensor is a view, or detached."""
+    others = [t for t in (*geometry, *sh) if t._is_view() or not t.requires_grad]
+    memory = {tensor.untyped_storage().data_ptr() for tensor in others}
+    for optimizer in lazy:
+        optimizer.catch_up(geometry)
+        if memory:
+            known = [param for group in optimizer.param_groups for param in group["params"]]
+            optimizer.catch_up([param for param in known if param.untyped_storage().data_ptr() in memory])
 
 
 def _check_leaves(params: Mapping[str, Tensor]) -> None:

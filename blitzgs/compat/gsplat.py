@@ -137,16 +137,17 @@ class DefaultStrategy(Strategy):
             self._refine(params, optimizers, state, step, scene)
         if step % self.reset_every == 0 and step > 0:
             _catch_up(optimizers, moments=True)
-            most = torch.logit(torch.tensor(2 * self.prune_opa)).item()
+            most = math.log(2 * self.prune_opa / (1 - 2 * self.prune_opa))
             _renew(params, optimizers, lambda _, p: p.clamp(max=most), torch.zeros_like, ["opacities"])
 
     def _add_statistics(self, params: Params, state: dict[str, Any], info: dict[str, Any]) -> None:
         means2d = info[self.key_for_gradient]
-        gradients = means2d.absgrad if self.absgrad else means2d.grad
-        if gradients is None:
-            raise ValueError(
-                f'info["{self.key_for_gradient}"] has no gradient; call step_pre_backward before backward()'
+        name = "absgrad" if self.absgrad else "grad"
+        if (gradients := getattr(means2d, name, None)) is None:
+            remedy = (
+                "render with absgrad=True" if self.absgrad else "call step_pre_backward before backward()"
             )
+            raise ValueError(f'info["{self.key_for_gradient}"] has no {name}; {remedy}')
         width, height, views = info["width"], info["height"], info["n_cameras"]
         across, down = gradients.unbind(-1)
         norms = torch.hypot(across * (width / 2 * views), down * (height / 2 * views))

@@ -285,9 +285,8 @@ def _check_settings(
     # From camera to clip space, for row vectors; the columns of x, y and w decide where a point is seen.
     clip = torch.linalg.solve(view, full)[:3, [0, 1, 3]]
     cx, cy = ((clip[2, :2] + 1) / 2).tolist()
-    expected = torch.tensor(
-        [[1 / settings.tanfovx, 0, 0], [0, 1 / settings.tanfovy, 0], [2 * cx - 1, 2 * cy - 1, 1]],
-        dtype=torch.float64,
+    expected = values.new_tensor(
+        [[1 / settings.tanfovx, 0, 0], [0, 1 / settings.tanfovy, 0], [2 * cx - 1, 2 * cy - 1, 1]]
     )
     if not ((clip - expected).abs() <= _CAMERA_TOLERANCE * expected.abs().clamp(min=1)).all():
         raise ValueError(

@@ -23,7 +23,7 @@ def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor
         degree: degree to evaluate, 0 to 4.
         dirs: [..., 3], floating point, of any length; the result of a zero vector is finite.
         coeffs: [..., K, D], K >= (degree + 1)^2; leading dimensions broadcast with those of `dirs`.
-        masks: bool [...]: where False, the result is 0; None: all True.
+        masks: bool [...]: where False, the result is 0, without a gradient; None: all True.
 
     Returns:
         [..., D], of the wider dtype of the two.
@@ -51,6 +51,8 @@ def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor
             f"leading dimensions must broadcast: dirs {list(dirs.shape)}, coeffs {list(coeffs.shape)}, masks "
             f"{None if masks is None else list(masks.shape)}"
         ) from None
+    if masks is not None:  # a direction that is not finite would spoil the gradients of its coefficients
+        dirs = torch.where(masks.unsqueeze(-1), dirs, torch.zeros_like(dirs))
     dtype = torch.promote_types(dirs.dtype, coeffs.dtype)
     values = (_basis(dirs, degree).unsqueeze(-2).to(dtype) @ coeffs[..., :count, :].to(dtype)).squeeze(-2)
     return values if masks is None else torch.where(masks.unsqueeze(-1), values, torch.zeros_like(values))

@@ -78,7 +78,7 @@ def _weights(
     means2d: Tensor, conics: Tensor, opacities: Tensor, width: int, height: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Return alpha before clipping, alpha, T before and after it, and alpha T where composited, [M, H W]."""
-    columns, rows = (torch.arange(size).to(means2d) + 0.5 for size in (width, height))
+    columns, rows = (torch.arange(size, device=means2d.device).to(means2d) + 0.5 for size in (width, height))
     dx, dy = columns.repeat(height) - means2d[:, :1], rows.repeat_interleave(width) - means2d[:, 1:]
     a, b, c = conics[:, :, None].unbind(dim=1)
     unclipped = opacities[:, None] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)

@@ -32,7 +32,7 @@ from blitzgs.view.views import CameraLike, Space, ViewSet, render_options, viewm
 from blitzgs.view.visible import Subject
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Model:
     """N trained Gaussians before activation, without optimiser state; lengths in trained units.
 
@@ -154,7 +154,7 @@ class Model:
             far_plane=options.far_plane,
             eps2d=options.eps2d,
             sh_degree=self.sh_degree,
-            backgrounds=torch.tensor([options.background] * len(cameras), device=self.means.device),
+            backgrounds=self.means.new_tensor([options.background] * len(cameras)),
             render_mode=render_mode,
             rasterize_mode="antialiased" if antialiased else "classic",
         )
@@ -229,8 +229,9 @@ class RunFolder:
             CheckpointError: all checkpoints are damaged.
         """
         chosen, _ = resolve_device(str(device), local_rank=0, local_world_size=1, share_gpus=False)
-        found = trained_model.open_model(self.path, Ranks(), only=checkpoint)
-        return dataclasses.replace(model_of(found, chosen), run=self)
+        with torch.device("cpu"):  # whatever the program's default device is
+            found = trained_model.open_model(self.path, Ranks(), only=checkpoint)
+            return dataclasses.replace(model_of(found, chosen), run=self)
 
     @staticmethod
     def _json(path: Path) -> dict[str, Any]:

@@ -132,9 +132,9 @@ class ViewSet:
 
     def pick(self, indices: list[int]) -> Views:
         """Return the views of cameras as one batch on the device (ValueError: they differ in size)."""
-        numbers = torch.empty(VIEW_NUMBERS * len(indices))
-        self.write(indices, numbers.numpy())
-        return unpack_views(numbers.to(self._device), *self.size(indices))
+        numbers = np.empty(VIEW_NUMBERS * len(indices), dtype=np.float32)
+        self.write(indices, numbers)
+        return unpack_views(torch.from_numpy(numbers).to(self._device), *self.size(indices))
 
 
 # The far plane, relative to the scene's extent: nothing is cut off.

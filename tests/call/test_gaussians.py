@@ -223,6 +223,18 @@ def test_gradients():
     assert at_zero.grad.isfinite().all()
 
 
+@pytest.mark.parametrize("bad", ["dirs", "coeffs"])
+def test_what_is_masked_has_no_gradient_even_if_it_is_not_finite(bad):
+    given = {"dirs": torch.randn(4, 2, 3), "coeffs": torch.randn(4, 1, 9, 3)}  # coefficients of both views
+    masks = torch.tensor([[True, False]] * 3 + [[False, False]])
+    given[bad][~masks if bad == "dirs" else 3] = torch.nan
+    leaves = {name: value.requires_grad_() for name, value in given.items()}
+    blitzgs.spherical_harmonics(2, **leaves, masks=masks).sum().backward()
+    for name, value in leaves.items():
+        assert value.grad.isfinite().all(), name
+    assert not leaves["dirs"].grad[~masks].any() and leaves["coeffs"].grad[:3].any()
+
+
 @pytest.mark.parametrize(
     ("degree", "dirs", "coeffs", "message"),
     [

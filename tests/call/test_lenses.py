@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 import blitzgs
-from tests.helpers import random_scene, rasterize_scene, refused
+from tests.helpers import PARAMETERS, random_scene, rasterize_scene, refused
 
 BROWN = (-0.2, 0.05, 0.0, 0.0, 0.0, 0.0, 0.005, -0.008, 0.002, 0.0, -0.003, 0.0)
 FISHEYE = (0.05, -0.02, 0.01, 0.0)
@@ -195,3 +196,15 @@ def test_lenses_that_are_not_finite_are_named():
 def test_what_does_not_go_together_is_refused_by_name(options, message):
     scene = wide_scene(n=4)
     refused(ValueError, message, blitzgs.rasterization, **{**vars(scene), **options})
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_forward_mode_derivatives_are_refused_by_name(name):
+    scene = wide_scene(n=4)
+    value = getattr(scene, name)
+    with forward_ad.dual_level():
+        dual = {name: forward_ad.make_dual(value, torch.ones_like(value))}
+        message = "with_ut does not support forward-mode derivatives"
+        refused(ValueError, message, blitzgs.rasterization, **{**vars(scene), **dual, "with_ut": True})
+        with pytest.raises(NotImplementedError, match="jvp"):  # torch's words
+            blitzgs.rasterization(**{**vars(scene), **dual})

@@ -6,7 +6,7 @@ import torch
 
 import blitzgs
 from blitzgs.optim import LazyAdam
-from tests.helpers import random_scene, refused, relative_error
+from tests.helpers import other_defaults, random_scene, refused, relative_error
 
 NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
@@ -226,6 +226,23 @@ def test_what_only_rasterization_or_gsplat_supports_is_refused(option):
         raw(raw_parameters(scene), scene, packd=value)
 
 
+@pytest.mark.parametrize("others", [{}, {"sh0": lambda t: t.squeeze(1), "means": lambda t: t}], ids=len)
+def test_rows_catch_up_behind_what_shares_their_memory(device, others):
+    """As in an evaluation of detached parameters, or of views of them."""
+    scene = spread(random_scene(n=60, device=device))
+    p = raw_parameters(scene)
+    optimizer = LazyAdam(p.values(), lr=0.1)
+    for number in (0, 0, 1):  # the view of the last step sees other Gaussians
+        raw(p, scene.view(number), optimizers=optimizer)[0].square().sum().backward()
+        optimizer.step()
+        optimizer.zero_grad()
+    with torch.no_grad():
+        shared = {name: others.get(name, torch.Tensor.detach)(t) for name, t in p.items()}
+        image = raw(shared, scene, optimizers=optimizer)[0]
+        optimizer.catch_up()
+        assert torch.equal(image, raw(p, scene)[0])
+
+
 def test_optimizers_may_be_one_of_any_class():
     scene = random_scene(n=20)
     p = raw_parameters(scene)
@@ -326,7 +343,7 @@ def test_memory_follows_what_is_visible():
     assert peak < 40e6  # 1 M Gaussians have 236 MB of parameters
 
 
-def test_the_default_device_of_torch_has_no_effect(device):
+def test_the_defaults_of_torch_have_no_effect(device):
     scene = spread(random_scene(n=40, device=device))
     targets = torch.full((2, scene.height, scene.width, 3), 0.5, device=device)
 
@@ -344,7 +361,7 @@ def test_the_default_device_of_torch_has_no_effect(device):
         return params
 
     expected = train()
-    with torch.device("meta"):
+    with other_defaults():
         actual = train()
     for name, param in expected.items():
         assert relative_error(actual[name], param) < 1e-5, name

@@ -9,7 +9,7 @@ import torch
 from blitzgs.compat import inria
 from blitzgs.reference.projection import sh_colors
 from blitzgs.util.rotations import quaternion_matrices
-from tests.helpers import orbit_camera, refused, relative_error, ssim_map
+from tests.helpers import orbit_camera, other_defaults, refused, relative_error, ssim_map
 
 
 def camera(angle=0.3, distance=3.0, tanfovx=0.5, tanfovy=0.4, shift=(0.0, 0.0), dtype=torch.float64):
@@ -320,6 +320,14 @@ def test_matrices_may_have_a_batch_dimension_of_one():
     wanted, found = (inria.GaussianRasterizer(s) for s in (plain, settings(**matrices)))
     assert torch.equal(found(means2D=None, **given)[0], wanted(means2D=None, **given)[0])
     assert torch.equal(found.markVisible(given["means3D"]), wanted.markVisible(given["means3D"]))
+
+
+def test_the_defaults_of_torch_have_no_effect():
+    given, rasterizer = without(leaves(), "colors_precomp"), inria.GaussianRasterizer(settings())
+    expected, _ = rasterizer(means2D=None, **given)
+    with other_defaults():
+        image, _ = rasterizer(means2D=None, **given)
+    assert torch.equal(image, expected)
 
 
 def test_visibility():

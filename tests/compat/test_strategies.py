@@ -207,8 +207,11 @@ def test_absolute_gradients_count_in_half_images():
     expected = torch.tensor([60.0, 0, 40 + math.hypot(20, 10), 0])
     assert torch.equal(state["grad2d"], expected) and state["count"].tolist() == [1, 0, 2, 0]
     info["means2d"] = torch.zeros(3, 2)
-    with pytest.raises(ValueError, match="step_pre_backward"):
-        DefaultStrategy().step_post_backward({"means": torch.zeros(4, 3)}, {}, state, 1, info)
+    for own, message in (
+        (strategy, "has no absgrad; render with absgrad=True"),
+        (DefaultStrategy(), "has no grad; call step_pre_backward"),
+    ):
+        refused(ValueError, message, own.step_post_backward, {"means": torch.zeros(4, 3)}, {}, state, 1, info)
 
 
 def relocation(opacities, scales, ratios, binoms, min_opacity=0.005):

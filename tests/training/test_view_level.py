@@ -24,6 +24,7 @@ from blitzgs.training.events import evaluate
 from blitzgs.training.step import Stepper
 from blitzgs.view.gate import centres_of
 from tests.distributed.rank_harness import on_each_device, run_ranks
+from tests.helpers import other_defaults
 from tests.training import tiny
 from tests.training.tiny import (
     assert_same_table,
@@ -208,7 +209,12 @@ def test_render_honours_the_gate(whole_run, tmp_path):
     assert main(["render", str(folder), "--out", str(tmp_path), "--raw", "--device", "cpu"]) == 0
     model = blitzgs.open_run(folder).model()
     assert model.lod is not None
-    np.testing.assert_allclose(np.load(tmp_path / "03.npy"), model.render(3).numpy(), rtol=0, atol=1e-5)
+    image = model.render(3)
+    np.testing.assert_allclose(np.load(tmp_path / "03.npy"), image.numpy(), rtol=0, atol=1e-5)
+    with other_defaults():  # of a program that opens the run
+        again = blitzgs.open_run(folder).model()
+        assert torch.equal(again.render(3), image)
+    assert again in [model, again] and again != model
 
 
 def test_a_gate_that_no_training_view_has_is_not_applied_elsewhere(tmp_path, monkeypatch):
