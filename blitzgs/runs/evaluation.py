@@ -36,8 +36,6 @@ from blitzgs.view.visible import Subject, VisibleFinder
 Lpips = Callable[[Tensor, Tensor], Tensor]
 Stops = Callable[[], bool]
 METRICS = ("psnr", "ssim", "psnr_corrected", "lpips")
-# Standard deviation of colours that float32 rounds to one.
-_LEAST_SPREAD = 1e-6
 
 
 class EvaluationStoppedError(Exception):
@@ -74,15 +72,12 @@ def correct_colours(pixels: Tensor, wanted: Tensor) -> Tensor:
     The map is fitted by least squares over the pixels of one view. It removes differences of exposure and
     white balance, which are properties of the photograph and not of the scene.
     """
-    mean, wanted_mean = pixels.mean(0), wanted.mean(0)
-    rest = pixels - mean
-    # Along the principal axes of the colours, each gain is found by itself.
+    mean, rest = wanted.mean(0), pixels - pixels.mean(0)
     squares, axes = torch.linalg.eigh(rest.T @ rest)
-    along = rest @ axes
-    gains = along.T @ (wanted - wanted_mean) / squares[:, None]
-    # Along an axis on which the colours differ by rounding alone, any gain is equally good.
-    gains = torch.where(squares[:, None] > len(pixels) * _LEAST_SPREAD**2, gains, 0.0)
-    return (wanted_mean + along @ gains).clamp(0.0, 1.0)
+    # Along an axis on which the colours differ by the rounding of float32 alone, all maps are equally good.
+    along = rest @ axes[:, squares > 1e-12 * len(pixels)]
+    gains = along.T @ (wanted - mean) / along.square().sum(0)[:, None]
+    return (mean + along @ gains).clamp(0.0, 1.0)
 
 
 def _psnr(pixels: Tensor, wanted: Tensor) -> float:
