@@ -308,7 +308,10 @@ def _check_settings(
 def _radii(splats: ProjectedSplats, count: int) -> Tensor:
     """Return three standard deviations of each Gaussian's longer axis, px, as INRIA's code rounds them."""
     a, b, c = splats.conics.detach().double().unbind(dim=1)
-    variance = 1 / (a * c - b * b)  # the determinant of the covariance
+    # As `three_sigma_radius` of csrc/population/density.h: what rounding left of a thin splat's determinant,
+    # or took below zero, would make the longest splats tiny.
+    rounding = torch.finfo(splats.conics.dtype).eps
+    variance = 1 / torch.maximum(a * c - b * b, rounding * a * c)  # the determinant of the covariance
     middle = 0.5 * (a + c) * variance
     longest = middle + (middle.square() - variance).clamp(min=0.1).sqrt()
     radii = splats.gaussian_ids.new_zeros(count)

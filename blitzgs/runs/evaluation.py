@@ -72,10 +72,12 @@ def correct_colours(pixels: Tensor, wanted: Tensor) -> Tensor:
     The map is fitted by least squares over the pixels of one view. It removes differences of exposure and
     white balance, which are properties of the photograph and not of the scene.
     """
-    known = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)
-    # The pseudo-inverse also handles a view of a single colour, for which many maps are equally good.
-    inverse = torch.linalg.pinv(known.T @ known, hermitian=True)
-    return (known @ (inverse @ (known.T @ wanted))).clamp(0.0, 1.0)
+    mean, rest = wanted.mean(0), pixels - pixels.mean(0)
+    squares, axes = torch.linalg.eigh(rest.T @ rest)
+    # Along an axis on which the colours differ by the rounding of float32 alone, all maps are equally good.
+    along = rest @ axes[:, squares > 1e-12 * len(pixels)]
+    gains = along.T @ (wanted - mean) / along.square().sum(0)[:, None]
+    return (mean + along @ gains).clamp(0.0, 1.0)
 
 
 def _psnr(pixels: Tensor, wanted: Tensor) -> float:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from blitzgs.frame.ownership import TileOwners
-from blitzgs.table.pool import Pool
 from blitzgs.training.events import save
 from blitzgs.training.state import TrainingState
 from blitzgs.util.errors import warn
@@ -66,9 +65,7 @@ class Watching:
             return
         begin, state = time.perf_counter(), self._state
         try:
-            if isinstance(state.stepper.gaussians, Pool):
-                # The pool is filled for the view, and written back with nothing pending.
-                state.catch_up()
+            state.stepper.write_back()  # a pool takes the rows that the view sees
             picture = Drawer(state.subject(), TileOwners(state.ranks)).draw(wish.look)
         except Exception as error:
             if state.ranks.world_size > 1 and not isinstance(error, DrawingError):

@@ -233,6 +233,19 @@ def test_float32_on_each_device(device, length):
         assert relative_error(actual, expected) < 1e-4
 
 
+def test_needles_longer_than_float32_has_digits_are_not_small():
+    """A trainer prunes by radius; rounding leaves nothing of the determinant of their covariance."""
+    given = without(leaves(8), "colors_precomp")
+    scales = torch.tensor([1e3, 1e-3, 1e-3]).expand_as(given["scales"]).double()
+    full = covariances(scales, torch.nn.functional.normalize(given["rotations"], dim=1), 1).float()
+    used = {name: given[name].detach().float() for name in ("means3D", "opacities", "shs")}
+    used["cov3D_precomp"] = full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    moved = {n: v.float() for n, v in settings()._asdict().items() if isinstance(v, torch.Tensor)}
+    screen = torch.zeros_like(used["means3D"])
+    _, radii, _ = inria.GaussianRasterizer(settings(antialiasing=False, **moved))(means2D=screen, **used)
+    assert (radii > 0).sum() > 20 and radii[radii > 0].min() > 3_000
+
+
 def test_precomputed_covariances():
     given = leaves(5)
     full = covariances(given["scales"], given["rotations"], 1).detach()

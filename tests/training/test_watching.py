@@ -139,15 +139,18 @@ def test_a_rank_that_cannot_draw_does_not_end_the_training(tmp_path):
     assert images == other == 20
 
 
-def test_a_model_in_host_memory_is_shown(tmp_path):
-    settings = ("schedule.iterations=20", "memory.resident_gb=0.001")
-    trainer, watcher, summary = watched_run(tmp_path, *settings)
+def test_a_model_in_host_memory_is_shown_and_does_not_change(tmp_path):
+    gate = ("schedule.densify_until=0", "view.lod=smooth", "view.footprint=0.1")  # rows fall behind
+    settings = (*gate, "memory.resident_gb=0.001")
+    trainer, watcher, _ = watched_run(tmp_path, *settings)
     assert trainer.state.stepper.gaussians is not trainer.state.table
-    assert len(watcher.pictures) == 19
+    assert len(watcher.pictures) == 39
     assert watcher.failures == []
     assert watcher.pictures[-1].values.std() > 10
-    _, alone = train(tmp_path / "alone", *settings)
-    assert summary["psnr"] == pytest.approx(alone["psnr"], abs=1e-3)
+    alone, _ = train(tmp_path / "alone", STEPS, *settings)
+    table = alone.state.table
+    assert (table["last_step"] - table["moment_step"]).max() > 20
+    assert_same_table(trainer.state.table, table)
 
 
 def test_a_fully_masked_view_counts_for_nothing(tmp_path, capsys):
