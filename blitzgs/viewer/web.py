@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
-from blitzgs.capture.world import GEOCENTRIC, WorldFrame, converted, reference_system
+from blitzgs.capture.world import GEOCENTRIC, WorldFrame, converted
 from blitzgs.config.files import changed
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import Gaussians, GaussianSource, up_of
@@ -225,7 +225,7 @@ def to_globe(frame: WorldFrame, origin: Array) -> Array:
     step = 10.0
     places = origin + step * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     with located(frame.source):
-        globe = converted(frame.to_world(places), reference_system(frame.crs).to_3d(), GEOCENTRIC)
+        globe = converted(frame.to_world(places), frame.crs, GEOCENTRIC)
     matrix = np.eye(4)
     matrix[:3, :3] = (globe[1:4] - globe[4:]).T / (2 * step)
     matrix[:3, 3] = globe[0]

@@ -4,8 +4,10 @@
 import json
 import re
 import shutil
+import warnings
 
 import numpy as np
+import plyfile
 import pytest
 
 from blitzgs.capture import colmap
@@ -179,6 +181,22 @@ def test_a_ply_beside_the_points_of_the_model_is_not_used(tmp_path):
 
 
 UTM = np.array([412_345.0, 5_654_321.0, 120.0])
+
+
+@pytest.mark.parametrize(("kind", "local"), [("f4", False), ("f8", False), ("f4", True)])
+def test_points_that_float32_rounds_are_named(tmp_path, kind, local):
+    capture = files.Posed(origin=np.zeros(3) if local else UTM)
+    rows = np.zeros(len(capture.points), [(axis, kind) for axis in "xyz"])
+    for axis, column in zip("xyz", capture.points.T, strict=True):
+        rows[axis] = column
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(tmp_path / "p.ply")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        file_points(tmp_path / "p.ply")
+    rounded = [
+        str(w.message) for w in caught if "p.ply: its float32 positions are rounded to 0.5" in str(w.message)
+    ]
+    assert len(rounded) == (kind == "f4" and not local)
 
 
 def write_las(path, positions, colors=None, crs=None):

@@ -21,6 +21,7 @@ from blitzgs.capture.world import (
     read_world_frame,
 )
 from tests.capture import helpers as files
+from tests.capture.helpers import warned
 from tests.helpers import refused
 
 TURN = Rotation.from_euler("xyz", [10, -70, 130], degrees=True).as_matrix()
@@ -120,6 +121,42 @@ def test_a_frame_in_utm_is_right_within_its_stated_error():
     assert utm.label(np.zeros(3)).startswith("E 443") and utm.label(np.zeros(3)).endswith("(EPSG:32632)")
     refused(ValueError, "EPSG:4326 .* has angles", frame_in, frame, "EPSG:4326", places)
     refused(ValueError, "'EPSG:0' is no reference system", frame_in, frame, "EPSG:0", places)
+
+
+def test_heights_are_in_the_unit_of_lengths(tmp_path):
+    """Of systems in feet, pyproj has heights in metres, with which a model would be flat."""
+    pytest.importorskip("pyproj")
+    frame = enu_frame(37.5, -122.0, 300.0, "here")
+    places = np.random.default_rng(2).uniform(-150, 150, (60, 3))
+    feet, error = frame_in(frame, "EPSG:2227", places)
+    metres, _ = frame_in(frame, "EPSG:32610", places)
+    assert feet.scale == pytest.approx(metres.scale * 3937 / 1200, rel=1e-3) and error < 0.1
+    assert feet.to_world(np.zeros(3))[2] == pytest.approx(300 * 3937 / 1200, abs=0.1)
+    assert metres.to_world(np.zeros(3))[2] == pytest.approx(300, abs=0.1)
+    back, error = frame_in(feet, "EPSG:4978", places)
+    np.testing.assert_allclose(back.to_world(places), frame.to_world(places), atol=0.1)
+    refused(ValueError, "heights in another unit", frame_in, frame, "EPSG:2227+5703", places)
+
+
+def test_a_projection_of_another_place_and_missing_grids_are_named():
+    pyproj = pytest.importorskip("pyproj")
+    frame = enu_frame(48.0, 11.5, 500.0, "here")
+    places = np.random.default_rng(2).uniform(-150, 150, (60, 3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for near in ("EPSG:25832", "EPSG:25833", "EPSG:4978"):
+            frame_in(frame, near, places)
+    warned(
+        r"lengths in EPSG:3857 .* are 1.[0-9]+ times those on the ground",
+        frame_in,
+        frame,
+        "EPSG:3857",
+        places,
+    )
+    warned("lengths in EPSG:32610 .* times those", frame_in, frame, "EPSG:32610", places)
+    if not pyproj.transformer.TransformerGroup("EPSG:4979", "EPSG:25832+7837").best_available:
+        message = r"to ETRS89 / UTM zone 32N \+ DHHN2016 height, places may be .* \(de_bkg_gcg2016.tif\)"
+        warned(message, frame_in, frame, "EPSG:25832+7837", places)
 
 
 TILT = Rotation.from_euler("xyz", [3, -8, 100], degrees=True).as_matrix()

@@ -19,8 +19,6 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 from xml.parsers import expat
 
-import numpy as np
-
 from blitzgs.capture.cameras import pose_of
 from blitzgs.capture.fields import image_size, number, numbers, read_bytes
 from blitzgs.capture.lens import Lens
@@ -144,9 +142,7 @@ def _frame(chunk: Element, component: str | None, path: Path) -> WorldFrame | No
     rotation = rotation_of(numbers(values, "rotation", 9).reshape(3, 3))
     reference = (chunk.findtext("reference") or "").strip()
     local = not reference or reference.upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS"))
-    # Rounded numbers of the file make the rotation one to about 1e-7 only.
-    u, _, vt = np.linalg.svd(rotation)
     translation = numbers(values, "translation", 3)
     return WorldFrame(
-        "" if local else GEOCENTRIC, number(values, "scale", 1.0), u @ vt, translation, path.name
+        "" if local else GEOCENTRIC, number(values, "scale", 1.0), rotation, translation, path.name
     )

@@ -143,9 +143,9 @@ def read_bundler(path: Path) -> Project:
     for index, row in enumerate(rows):
         if row[0] == 0:  # not registered
             continue
-        rotation = row[3:12].reshape(3, 3)
         with located(f"camera {index} ({names[index]})"):
-            pose = pose_of(rotation_of(rotation.T * [1, -1, -1]), -rotation.T @ row[12:15])
+            rotation = rotation_of(row[3:12].reshape(3, 3).T)
+            pose = pose_of(rotation * [1, -1, -1], -rotation @ row[12:15])
         views.append(ProjectView(names[index], functools.partial(_bundle_lens, row[:3]), pose))
     return Project(views, _points(path, lines[5 * cameras :], points), lost=cameras - len(views))
 
