@@ -90,7 +90,10 @@ class Selected:
             self._met[chosen[order[selection.most :]]] = False
         self._count = int(self._met.sum())
         if self._count == 0:
-            raise ValueError("no Gaussian meets the conditions: choose a larger region, or lower limits")
+            raise ValueError(
+                "no Gaussian meets the conditions: choose a larger region, or lower limits"
+                + _where(source, np.array(origin))
+            )
 
     def __len__(self) -> int:
         return self._count
@@ -103,6 +106,17 @@ class Selected:
             first += len(block)
             if len(chosen):
                 yield replace(chosen, sh=chosen.sh[:, : (self.degree + 1) ** 2])
+
+
+def _where(source: GaussianSource, origin: Array) -> str:
+    """Return where the Gaussians of a source lie, as the end of an error: a region may be of another system."""
+    means = (block.means[block.sound()] for block in source.blocks())
+    ends = [some.aminmax(dim=0) for some in means if len(some)]
+    if not ends:
+        return ""
+    least, largest = torch.stack([e.min for e in ends]).amin(0), torch.stack([e.max for e in ends]).amax(0)
+    corners = (", ".join(f"{x:.9g}" for x in end.numpy() + origin) for end in (least, largest))
+    return "; the model is from ({}) to ({})".format(*corners)
 
 
 def opacity_length(opacities: Tensor, scales: Tensor) -> Tensor:
