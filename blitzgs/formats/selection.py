@@ -109,7 +109,7 @@ class Selected:
 
 
 def _where(source: GaussianSource, origin: Array) -> str:
-    """Return where the Gaussians of a source lie, as the end of an error: a region may be of another system."""
+    """Return where the Gaussians lie, [3] to [3], as the end of an error: regions may be of other systems."""
     means = (block.means[block.sound()] for block in source.blocks())
     ends = [some.aminmax(dim=0) for some in means if len(some)]
     if not ends:
