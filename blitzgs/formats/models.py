@@ -35,6 +35,7 @@ class Format:
     harmonics: bool = True  # whether it holds SH coefficients beyond the DC
     quantised: bool = True  # whether positions are finer near the origin than float32 makes them
     ranges: str = ""  # to which `write` cuts values
+    position: str = "coordinates in the file"  # what, plus the offset, are the model's coordinates
 
     def unstated(self, source: GaussianSource) -> list[str]:
         """Return what a viewer of the file will not know of a model, each a sentence without a full stop."""
@@ -79,9 +80,13 @@ FORMATS = {
     "spz": Format(
         "SPZ", ".spz", packed.read_spz, packed.write_spz, (b"\x1f\x8b", b"NGSP"), ("antialiasing",),
         ranges="scales of 0.000045 to 379 units, colours to 1.44 of white and SH coefficients to 1",
+        position="(x, -y, -z) of the coordinates in the file",
     ),
     "sog": Format("SOG", ".sog", read_sog, write_sog, (b"PK",), ("antialiasing",)),
-    "glb": Format("GLB", ".glb", None, write_glb, (b"glTF",), ("levels",), quantised=False),
+    "glb": Format(
+        "GLB", ".glb", None, write_glb, (b"glTF",), ("levels",), quantised=False,
+        position="coordinates in the file, without the turn of its node,",
+    ),
 }  # fmt: skip
 
 

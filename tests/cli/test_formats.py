@@ -30,6 +30,7 @@ from blitzgs.viewer.studio import open_model as open_viewed
 from blitzgs.viewer.web import open_city, web_file
 from blitzgs.viewer.world import Stance, World
 from tests.capture import helpers as files
+from tests.helpers import glb_parts
 from tests.training.tiny import OVERRIDES, as_flags
 
 os.environ.setdefault("NUMBA_DISABLE_JIT", "1")
@@ -142,6 +143,38 @@ def test_files_keep_their_place_in_the_world(whole, tmp_path, capsys):
             assert offset_of(found.comments) == tuple(offset)
         assert main(["export", str(whole), f"--{kind}", str(path)]) == 0
         assert not (tmp_path / f"model.{kind}.offset.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("kind", "position", "axes"),
+    [
+        ("ply", "coordinates in the file", [1, 1, 1]),
+        ("spz", "(x, -y, -z) of the coordinates in the file", [1, -1, -1]),
+        ("glb", "coordinates in the file, without the turn of its node,", [1, 1, 1]),
+    ],
+)
+def test_the_offset_beside_a_file_is_that_of_what_other_readers_find(whole, tmp_path, kind, position, axes):
+    model, path = read_gaussians(whole), tmp_path / f"model.{kind}"
+    write_ply(
+        tmp_path / "m.ply", **vars(dataclasses.replace(model, comments=["comment offset 500000 4.6e6 9"]))
+    )
+    assert main(["export", str(tmp_path / "m.ply"), f"--{kind}", str(path)]) == 0
+    stated = json.loads(path.with_name(f"model.{kind}.offset.json").read_text())
+    assert stated["meaning"] == f"capture coordinates = {position} + offset"
+    if kind == "glb":
+        content, body = glb_parts(path)
+        accessor = content["accessors"][content["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
+        begin = content["bufferViews"][accessor["bufferView"]].get("byteOffset", 0)
+        raw = np.frombuffer(body, "<f4", 3 * len(model), begin).reshape(-1, 3)
+    elif kind == "spz":
+        read = pytest.importorskip("gaussforge").GaussForge().read(path.read_bytes(), "spz")
+        raw = np.frombuffer(read["data"]["positions"], "<f4").reshape(-1, 3)
+    else:
+        raw = read_gaussians(path).means.numpy()
+    expected = model.means.double().numpy() + [500_000.0, 4_600_000.0, 9.0]
+    np.testing.assert_allclose(
+        (raw * axes + stated["offset"]).mean(axis=0), expected.mean(axis=0), atol=0.001
+    )
 
 
 @pytest.mark.parametrize("name", ["ply", "compressed-ply", "sog"])
