@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -159,12 +160,26 @@ def offset_file(path: Path) -> Path:
 
 def stated_offset(path: Path) -> tuple[float, float, float] | None:
     """Return the offset in an `offset_file`; None: there is none, or another program wrote the file."""
+    content = _stated(path)
+    return None if content is None else content["offset"]
+
+
+def system_of(path: Path, source: GaussianSource) -> str | None:
+    """Return the reference system of a file's model, empty if it is unknown; None: it is not in the world."""
+    content = _stated(offset_file(path))
+    if content is None or content["offset"] != offset_of(source.comments):
+        return None
+    return content["crs"] if content["meaning"].startswith("world") else None
+
+
+def _stated(path: Path) -> dict[str, Any] | None:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         x, y, z = (float(value) for value in content["offset"])
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        texts = {name: str(content[name]) for name in ("file", "meaning")}
+        return {**texts, "offset": (x, y, z), "crs": str(content.get("crs", ""))}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return None
-    return (x, y, z) if {"file", "meaning"} <= content.keys() else None
 
 
 def offset_of(comments: list[str]) -> tuple[float, float, float]:

@@ -98,10 +98,10 @@ def export_folder(
     return _write(source, shift, offset if centred else None, write, path)[0]
 
 
-def export_file(source: GaussianSource, kind: Format, path: Path) -> Exported:
+def export_file(source: GaussianSource, kind: Format, path: Path, crs: str | None = None) -> Exported:
     """Write the model of a file, with its offset; where it is far from the origin, with one that is near it.
 
-    ValueError, OSError: as `export`.
+    `crs`, ValueError, OSError: as for `export`.
     """
     check_replaces(path, kind)
     offset, shift = np.array(offset_of(source.comments)), np.zeros(3)
@@ -112,7 +112,7 @@ def export_file(source: GaussianSource, kind: Format, path: Path) -> Exported:
             shift = np.round((low + high) / 2)
     x, y, z = (offset + shift).tolist()
     stated = (x, y, z) if offset.any() or shift.any() else None
-    sidecar, lost = _write(source, -shift, stated, kind.write, path, kind.position)
+    sidecar, lost = _write(source, -shift, stated, kind.write, path, kind.position, crs)
     return Exported(stated, sidecar, 0.0, lost or Lost())
 
 

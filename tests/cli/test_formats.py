@@ -143,6 +143,8 @@ def test_files_keep_their_place_in_the_world(whole, tmp_path, capsys):
             assert offset_of(found.comments) == tuple(offset)
         assert main(["export", str(whole), f"--{kind}", str(path)]) == 0
         assert not (tmp_path / f"model.{kind}.offset.json").exists()
+    assert main(["export", str(near), "--tiles", str(tmp_path / "tiles")]) == 0
+    assert "the tiles lie around (500000.0, 4600000.0, 100.0); `blitzgs align" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -284,11 +286,17 @@ def test_control_points_give_the_world(trained, survey, tmp_path, capsys):
     assert main(["export", str(trained[1]), "--ply", str(tmp_path / "m.ply"), "--coordinates", "world"]) == 0
     offset = json.loads((tmp_path / "m.ply.offset.json").read_text())
     assert offset["crs"] == "EPSG:32632" and offset["meaning"].startswith("world coordinates = ")
+    # Other files that are made of it are in the world, too.
+    assert main(["export", str(tmp_path / "m.ply"), "--spz", str(tmp_path / "m.spz")]) == 0
+    again = json.loads((tmp_path / "m.spz.offset.json").read_text())
+    assert again["crs"] == "EPSG:32632" and again["meaning"].startswith("world coordinates = ")
     up = triple_of(open_source(trained[1]).comments, "up")
     there = triple_of(read_gaussians(tmp_path / "m.ply").comments, "up")
     np.testing.assert_allclose(there, TURN @ up, atol=1e-9)
-    # Into the next zone, where grid north is elsewhere: a turn by the convergence of both.
     pytest.importorskip("pyproj")
+    origin = open_city(trained[1]).transform()[:3, 3]
+    np.testing.assert_allclose(open_city(tmp_path / "m.spz").transform()[:3, 3], origin, atol=1e-3)
+    # Into the next zone, where grid north is elsewhere: a turn by the convergence of both.
     assert main(["align", str(trained[1]), "--crs", "EPSG:32633"]) == 0
     assert "is wrong by at most" in capsys.readouterr().out
     moved = load_world_frame(trained[1])
