@@ -30,6 +30,8 @@ from blitzgs.util.errors import printable, warn
 
 # -1 for photographs that look straight down, or level; -1.4 between the two.
 _TURNED_OVER = 0.3
+# Cameras are around the origin if it is nearer than so many times their spread.
+_LOCAL = 5.0
 
 HELP = """\
 Find out where the model of a run lies in the world, and write that to RUN/geo.json, which `blitzgs view` and
@@ -155,9 +157,21 @@ def _converted(args: argparse.Namespace, capture: Capture) -> WorldFrame:
     if known is None or not known.crs:
         _check_lengths(args.crs)
         frame = known or WorldFrame()
+        _warn_if_local(frame.to_world(_centres(capture))[:, :2], args.crs)
         source = frame.source or "the capture's own coordinates"
         return dataclasses.replace(frame, crs=args.crs, source=source)
     return _in_system(known, args.crs, capture)
+
+
+def _warn_if_local(places: Float64, crs: str) -> None:
+    """Warn of cameras [N, 2] around the origin of a reference system, which is far from most sites."""
+    middle = places.mean(axis=0)
+    if np.linalg.norm(middle) < _LOCAL * np.ptp(places, axis=0).max():
+        east, north = middle.tolist()
+        warn(
+            f"the cameras lie around E {east:.6g} N {north:.6g} of {crs}: if these are the capture's own "
+            "coordinates, find the world by --gcp or --gps"
+        )
 
 
 def _in_system(frame: WorldFrame, crs: str, capture: Capture) -> WorldFrame:

@@ -311,6 +311,12 @@ def test_a_world_of_exchanged_axes_is_named(trained, survey, tmp_path, capsys):
         assert main(["align", str(trained[1]), "--gcp", str(path), "--crs", "EPSG:32632"]) == 0
 
 
+def test_coordinates_around_the_origin_are_hardly_those_of_a_map(trained, survey):
+    (trained[1] / "geo.json").unlink(missing_ok=True)
+    with pytest.warns(UserWarning, match="the cameras lie around E .* of EPSG:32632: .* --gcp or --gps"):
+        assert main(["align", str(trained[1]), "--crs", "EPSG:32632"]) == 0
+
+
 def test_what_cannot_be_aligned_is_refused(trained, survey, tmp_path, failure):
     _, rows = survey
     path = tmp_path / "gcp.csv"
