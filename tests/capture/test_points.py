@@ -240,16 +240,18 @@ def test_e57_applies_the_pose_of_each_scan(tmp_path):
     np.testing.assert_array_equal(found.colors, capture.colors)
 
 
-def test_points_of_another_reference_system_are_moved_to_the_cameras(tmp_path):
-    """Metashape's cameras are in a chunk's coordinates, its points in UTM."""
+@pytest.mark.parametrize(
+    ("at", "crs", "foot"), [((47.5, 8.25), "EPSG:32632", 1), ((37.5, -122.0), "EPSG:2227", 1200 / 3937)]
+)
+def test_points_of_another_reference_system_are_moved_to_the_cameras(tmp_path, at, crs, foot):
+    """Metashape's cameras are in a chunk's coordinates, its points in UTM, or in feet."""
     pyproj = pytest.importorskip("pyproj")
-    place = np.array(pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978").transform(47.5, 8.25, 432.0))
+    place = np.array(pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978").transform(*at, 432.0))
     capture = files.Posed(origin=place)
     chunk, scale, shift = files.metashape(capture, capture.write_images(tmp_path) / "cameras.xml")
-    utm = pyproj.Transformer.from_crs("EPSG:4978", pyproj.CRS("EPSG:32632").to_3d()).transform(
-        *capture.points.T
-    )
-    write_las(tmp_path / "cloud.las", np.stack(utm, axis=1), capture.colors, pyproj.CRS("EPSG:32632"))
+    moved = pyproj.Transformer.from_crs("EPSG:4978", pyproj.CRS(crs).to_3d()).transform(*capture.points.T)
+    rows = np.stack(moved, axis=1) / [1, 1, foot]  # pyproj's heights are in metres
+    write_las(tmp_path / "cloud.las", rows, capture.colors, pyproj.CRS(crs))
     _, points, _ = read_layout(tmp_path, "images", 1)
     local = (capture.points - shift) @ chunk / scale
     np.testing.assert_allclose(points.positions, local, atol=2e-4)
