@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Projects of other programs give the pixels, points and world of the capture that they were written from."""
 
+import re
 import shutil
 
 import numpy as np
@@ -80,15 +81,17 @@ def test_metashape_fisheye(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("separator", "header"),
-    [(",", "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"),
-     (";", "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2")],
+    ("separator", "mark", "header"),
+    [(",", ".", "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"),
+     (";", ".", "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"),
+     (";", ",", "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2")],
 )  # fmt: skip
-def test_realitycapture_with_the_points_of_a_bundle(tmp_path, separator, header):
+def test_realitycapture_with_the_points_of_a_bundle(tmp_path, separator, mark, header):
     capture = files.Posed(origin=UTM)
     path = capture.write_images(tmp_path) / "registration.csv"
     files.realitycapture(capture, path, header)
-    path.write_text(path.read_text().replace(",", separator))
+    text = re.sub(r"(?<=[0-9])[.](?=[0-9])", mark, path.read_text().replace(",", separator))
+    path.write_text(text)
     files.bundler(capture, tmp_path / "bundle.out")
     views, points, source = read(tmp_path)
     assert residual(capture, views) < 1e-4

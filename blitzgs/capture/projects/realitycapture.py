@@ -61,9 +61,9 @@ def read_realitycapture(path: Path) -> Project:
     """Read the cameras of a CSV file."""
     lines = read_text(path).splitlines()
     first = next(i for i, line in enumerate(lines[:2]) if set(_NEEDED) <= set(_columns(line)))
-    columns = _columns(lines[first])
+    columns, separator = _columns(lines[first]), _separator(lines[first])
     views, centres = [], []
-    rows = csv.reader(lines[first + 1 :], delimiter=_separator(lines[first]))
+    rows = csv.reader(lines[first + 1 :], delimiter=separator)
     for place, row in enumerate(rows, start=first + 2):
         if not row or row[0].startswith("#"):
             continue
@@ -71,7 +71,10 @@ def read_realitycapture(path: Path) -> Project:
             if len(row) != len(columns):
                 raise ValueError(f"{len(row)} values in {len(columns)} columns; export it again")
             cells = dict(zip(columns, row, strict=True))
-            values = {key: number(cells, key) for key in columns if key in _NUMBERS}
+            texts = {key: cells[key] for key in columns if key in _NUMBERS}
+            if separator == ";":  # where a comma is the decimal mark
+                texts = {key: text.replace(",", ".") for key, text in texts.items()}
+            values = {key: number(texts, key) for key in texts}
             # Of axes right, up and backwards; ours are right, down and forward.
             rotation = turn("z", -values["heading"]) @ turn("x", values["pitch"]) @ turn("y", values["roll"])
             centre = [values["x"], values["y"], values["alt"]]
