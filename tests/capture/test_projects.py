@@ -127,8 +127,12 @@ def test_realitycapture_in_degrees_is_refused(tmp_path):
 
 
 def test_bundler(tmp_path):
-    capture = files.Posed(cx=files.WIDTH / 2, cy=files.HEIGHT / 2, k=(-0.1, 0.02, 0.0), p=(0.0, 0.0))
+    names = [f"Flug 0 {i}.JPG" for i in range(6)]
+    middle = {"cx": files.WIDTH / 2, "cy": files.HEIGHT / 2}
+    capture = files.Posed(names=names, k=(-0.1, 0.02, 0.0), p=(0.0, 0.0), **middle)
     files.bundler(capture, capture.write_images(tmp_path) / "bundle.out")
+    listed = tmp_path / "list.txt"  # a line may have the focal length
+    listed.write_text(listed.read_text().replace("0 2.JPG", "0 2.JPG 0 1234.5"))
     views, points, source = read(tmp_path)
     assert residual(capture, views) < 1e-9
     np.testing.assert_array_equal(points.positions, capture.points)

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import csv
 import functools
+import re
 from pathlib import Path
 
 import numpy as np
@@ -165,10 +166,8 @@ def _names(path: Path, count: int) -> list[str]:
     if found is None:
         raise ValueError("it has no list of its photographs: put list.txt, one name a line, beside it")
     # A line may have a focal length after the name.
-    names = [line.strip() for line in read_text(found).splitlines() if line.strip()]
-    names = [
-        name if len(words := name.rsplit(maxsplit=2)) < 3 or words[1] != "0" else words[0] for name in names
-    ]
+    lines = (line.strip() for line in read_text(found).splitlines())
+    names = [re.sub(r"\s+0\s+[\d.eE+-]+$", "", line) for line in lines if line]
     if len(names) != count:
         raise ValueError(f"{found} has {len(names)} names for its {count} cameras: they must agree")
     return names
