@@ -84,7 +84,8 @@ def _gcp_list(path: Path, lines: Sequence[str]) -> tuple[list[ControlPoint], str
     crs = lines[0].strip() if lines else ""
     points: dict[str, ControlPoint] = {}
     for place, line in enumerate(lines[1:], start=2):
-        words = line.split()
+        # Names may have blanks where tabs separate, as in lists of WebODM.
+        words = line.strip().split("\t" if line.count("\t") >= len(_NUMBERS) else None)
         if not words or words[0].startswith("#"):
             continue
         with located(f"{path}: line {place}"):

@@ -285,6 +285,12 @@ def test_both_files_of_points_are_read(setting, tmp_path):
     (tmp_path / "gcp_list.txt").write_text(text)
     again, crs = read_control_points(tmp_path / "gcp_list.txt")
     assert crs == "EPSG:32632" and [p.marks for p in again] == [p.marks for p in found]
+    tabs = [
+        "\t".join(map(str, (e, n, h, x, y, f"Flug 1/{image[:3]} 1.JPG"))) for _, e, n, h, image, x, y in rows
+    ]
+    (tmp_path / "gcp_list.txt").write_text("\n".join(["EPSG:32632", *tabs]))
+    again, _ = read_control_points(tmp_path / "gcp_list.txt")
+    assert {mark[0] for p in again for mark in p.marks} == {"Flug 1/DJI 1.JPG"}
 
 
 @pytest.mark.parametrize(
