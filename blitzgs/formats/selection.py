@@ -152,9 +152,12 @@ def read_polygon(path: Path) -> Array:
                 if len(content.get("features", [0])) != 1:
                     raise ValueError(f"it has {len(content['features'])} features: leave one")
                 content = content["features"][0] if "features" in content else content["geometry"]
-            if content["type"] != "Polygon" or len(content["coordinates"]) != 1:
-                raise ValueError("it is no polygon without holes")
-            rows = [corner[:2] for corner in content["coordinates"][0]]
+            kind, rings = content["type"], content["coordinates"]
+            if kind == "MultiPolygon" and len(rings) == 1:  # as QGIS writes all polygons
+                kind, rings = "Polygon", rings[0]
+            if kind != "Polygon" or len(rings) != 1:
+                raise ValueError("it is no single polygon without holes")
+            rows = [corner[:2] for corner in rings[0]]
         else:
             lines = (line.replace(",", " ").split() for line in text.splitlines())
             rows = [line for line in lines if line and not line[0].startswith("#")]

@@ -99,6 +99,15 @@ def test_realitycapture_with_the_points_of_a_bundle(tmp_path, separator, mark, h
     assert source.cameras == "registration.csv (RealityCapture)"
 
 
+@pytest.mark.parametrize("letters", ["utf-8", "utf-8-sig", "cp1252"])
+def test_names_with_umlauts_are_read_as_windows_and_others_write_them(tmp_path, letters):
+    capture = files.Posed(names=[f"Fl\u00e4che {i}.JPG" for i in range(6)])
+    path = capture.write_images(tmp_path) / "registration.csv"
+    files.realitycapture(capture, path)
+    path.write_text(path.read_text("utf-8-sig"), encoding=letters)
+    assert [camera.name for camera in load_capture(tmp_path).cameras] == capture.names
+
+
 def test_realitycapture_angles_are_those_of_its_help(tmp_path):
     angles = {"down.jpg": "0,0", "down_east.jpg": "90,0", "north.jpg": "0,90", "east.jpg": "90,90"}
     rows = [f"{name},{angle},0,1,2,3,30\n" for name, angle in angles.items()]

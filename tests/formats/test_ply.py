@@ -312,6 +312,10 @@ def test_polygons_of_files(tmp_path):
         np.testing.assert_array_equal(read_polygon(path), ring)
     bad = ("0 0\n1 1\n", "0 0\nx y\n1 1\n", "0 0\n1 1\nnan 2\n", "{", '{"type": "Point"}', "0 0 0\n" * 4)
     two = json.dumps({"type": "FeatureCollection", "features": [{"geometry": polygon}] * 2})
-    for text in (*bad, two):
+    parts = polygon["coordinates"]
+    qgis, apart = (json.dumps({"type": "MultiPolygon", "coordinates": [parts] * n}) for n in (1, 2))
+    path.write_text(qgis)
+    np.testing.assert_array_equal(read_polygon(path), ring)
+    for text in (*bad, two, apart):
         path.write_text(text)
         refused(ValueError, "region cannot be read as a polygon", read_polygon, path)
