@@ -15,6 +15,7 @@ from blitzgs.capture.capture import load_capture
 from blitzgs.capture.layouts import read_layout
 from blitzgs.capture.points import file_points
 from blitzgs.formats.ply import read_point_cloud
+from blitzgs.training import understood
 from tests.capture import helpers as files
 from tests.capture.helpers import as_text, frame, warned, write_capture, write_ply, write_transforms
 from tests.helpers import refused
@@ -255,6 +256,28 @@ def test_points_of_another_reference_system_are_moved_to_the_cameras(tmp_path, a
     _, points, _ = read_layout(tmp_path, "images", 1)
     local = (capture.points - shift) @ chunk / scale
     np.testing.assert_allclose(points.positions, local, atol=2e-4)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:4979"])
+def test_points_without_a_reference_system_have_that_of_the_project(tmp_path, crs):
+    """Metashape exports PLY in the chunk's reference system, which only its XML states."""
+    pyproj = pytest.importorskip("pyproj")
+    place = np.array(pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978").transform(47.5, 8.25, 432.0))
+    capture = files.Posed(origin=place)
+    path = capture.write_images(tmp_path) / "cameras.xml"
+    chunk, scale, shift = files.metashape(capture, path)
+    system = pyproj.CRS(crs).to_3d()
+    wkt = pyproj.CRS(crs).to_wkt("WKT2_2019" if crs == "EPSG:4979" else "WKT1_GDAL")
+    path.write_text(
+        re.sub("<reference>.*</reference>", lambda _: f"<reference>{wkt}</reference>", path.read_text())
+    )
+    moved = pyproj.Transformer.from_crs("EPSG:4978", system, always_xy=True).transform(*capture.points.T)
+    write_ply(tmp_path / "cloud.ply", np.stack(moved, axis=1), capture.colors)
+    loaded = warned(f"the points are in coordinates of {system.name}", read_layout, tmp_path, "images", 1)
+    np.testing.assert_allclose(loaded[1].positions, (capture.points - shift) @ chunk / scale, atol=2e-4)
+    write_ply(tmp_path / "cloud.ply", np.stack(moved, axis=1) + [1e9, 0, 0], capture.colors)
+    with pytest.raises(ValueError, match="see none of the"):
+        understood.check_worlds(load_capture(tmp_path))
 
 
 def test_points_in_world_coordinates_and_cameras_without_the_offset(tmp_path):

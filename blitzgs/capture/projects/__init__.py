@@ -36,13 +36,17 @@ class ProjectView:
 
 @dataclass(eq=False)
 class Project:
-    """The content of a project; `lost` counts photographs without a pose, `notes` say what has no effect."""
+    """The content of a project; `lost` counts photographs without a pose, `notes` say what has no effect.
+
+    `crs` is the reference system of points that are exported beside it, if that is not the frame's.
+    """
 
     views: list[ProjectView]
     points: SourcePoints | None = None
     frame: WorldFrame | None = None
     lost: int = 0
     notes: list[str] = field(default_factory=list)
+    crs: str = ""
 
 
 def rotation_of(matrix: Float64) -> Float64:
