@@ -71,6 +71,20 @@ def test_the_file_keeps_every_digit(tmp_path):
     np.testing.assert_array_equal(found.rotation, TURN)
 
 
+def test_an_offset_has_the_reference_system_of_its_name(tmp_path):
+    """Shapefiles of a site have a .prj of their own."""
+    (tmp_path / "site_offset.xyz").write_text("412345 5654321 100\n")
+    (tmp_path / "site_wkt.prj").write_text("EPSG:32633")
+    (tmp_path / "border.prj").write_text("EPSG:4326")
+    assert frame_beside(tmp_path).crs == "EPSG:32633"
+    (tmp_path / "site_offset.xyz").rename(tmp_path / "offset.txt")
+    refused(ValueError, "border.prj, site_wkt.prj differ, .* keep that one", frame_beside, tmp_path)
+    (tmp_path / "border.prj").unlink()
+    assert frame_beside(tmp_path).crs == "EPSG:32633"
+    (tmp_path / "other_offset.xyz").write_text("1 2 3")
+    refused(ValueError, "offset.txt, other_offset.xyz differ", frame_beside, tmp_path)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
