@@ -257,6 +257,17 @@ def pose_of(camera_to_world: Float64, centre: Float64 | Sequence[float]) -> Floa
     return pose
 
 
+def nearest_rotation(matrix: Float64) -> Float64:
+    """Return the rotation [3, 3] that a file rounded to a few digits; a matrix that is not finite as it is.
+
+    Of coordinates of millions of metres, what is lacking to a rotation would move camera centres by metres.
+    """
+    if not np.isfinite(matrix).all():
+        return matrix
+    u, _, vt = np.linalg.svd(matrix)
+    return np.asarray(u @ vt)
+
+
 def camera_centres(world_to_camera: Float64) -> Float64:
     """Return the positions [N, 3] of rigid poses [N, 4, 4]."""
     return np.asarray(-np.einsum("nji,nj->ni", world_to_camera[:, :3, :3], world_to_camera[:, :3, 3]))

@@ -6,7 +6,8 @@ from __future__ import annotations
 import csv
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -83,7 +84,8 @@ def _gcp_list(path: Path, lines: Sequence[str]) -> tuple[list[ControlPoint], str
     crs = lines[0].strip() if lines else ""
     points: dict[str, ControlPoint] = {}
     for place, line in enumerate(lines[1:], start=2):
-        words = line.split()
+        # Names may have blanks where tabs separate, as in lists of WebODM.
+        words = line.strip().split("\t" if line.count("\t") >= len(_NUMBERS) else None)
         if not words or words[0].startswith("#"):
             continue
         with located(f"{path}: line {place}"):
@@ -112,16 +114,16 @@ def place(points: Sequence[ControlPoint], cameras: Sequence[Camera], origin: Flo
 
     The cameras are those of a capture that was loaded without downscaling, `origin` is its `Capture.offset`.
     """
-    known, found = by_parts(camera.name for camera in cameras), []
-    # The marks have names without folders; they count where one camera is called so.
-    by_name = {key: cameras[some[0]] for key, some in known.items() if len(some) == 1}
+    by_name, found = _cameras_of({mark[0] for point in points for mark in point.marks}, cameras), []
     for point in points:
-        marks = [(by_name.get(any_case(mark[0]).rpartition("/")[2]), *mark) for mark in point.marks]
+        marks = [(by_name.get(mark[0]), *mark) for mark in point.marks]
         placed = replace(point, seen=[(camera, x, y) for camera, _, x, y in marks if camera is not None])
         found.append(placed)
         if len({camera.name for camera, _, _ in placed.seen}) < 2:
             lost = [image for camera, image, _, _ in marks if camera is None]
-            placed.problem = "marked in fewer than 2 views" + (f" ({lost[0]} is none)" if lost else "")
+            placed.problem = "marked in fewer than 2 views"
+            if lost:
+                placed.problem += f" ({lost[0]} is none, or several that only their folders tell apart)"
             continue
         try:
             rays = [normalised(camera.rectification.lens, x, y) for camera, x, y in placed.seen]
@@ -129,6 +131,26 @@ def place(points: Sequence[ControlPoint], cameras: Sequence[Camera], origin: Flo
         except ValueError as error:
             placed.problem = str(error)
     return found
+
+
+def _cameras_of(names: Iterable[str], cameras: Sequence[Camera]) -> dict[str, Camera]:
+    """Return the cameras of names of photographs, which may lack folders, or have those of another machine.
+
+    Of several photographs of one name, in folders of several flights, the folders decide.
+    """
+    known = by_parts(camera.name for camera in cameras)
+    folders = [any_case(camera.name).split("/")[-2::-1] for camera in cameras]
+    found, certain = {}, set()
+    for name in names:
+        last, *own = any_case(name).split("/")[::-1]
+        same = {index: len(os.path.commonprefix([own, folders[index]])) for index in known.get(last, [])}
+        best = [index for index, count in same.items() if count == max(same.values())]
+        if len(best) == 1:
+            found[name] = best[0]
+            if same[best[0]] == min(len(own), len(folders[best[0]])):
+                certain.add(name)
+    taken = {found[name] for name in certain}
+    return {name: cameras[i] for name, i in found.items() if name in certain or i not in taken}
 
 
 def normalised(lens: Lens, x: float, y: float) -> Float64:

@@ -28,8 +28,12 @@ def read_bytes(path: Path, most: int = _MOST) -> bytes:
 
 
 def read_text(path: Path, most: int = _MOST) -> str:
-    """Return the text of a file; errors as `read_bytes`."""
-    return read_bytes(path, most).decode("utf-8-sig", errors="replace")
+    """Return the text of a file in UTF-8, else in the letters of Windows; errors as `read_bytes`."""
+    content = read_bytes(path, most)
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("cp1252", errors="replace")
 
 
 def read_small(path: Path) -> str:

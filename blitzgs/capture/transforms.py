@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from blitzgs.capture.cameras import Float64, SourceView, pose_of
+from blitzgs.capture.cameras import Float64, SourceView, nearest_rotation, pose_of
 from blitzgs.capture.fields import Fields, entry, read_json
 from blitzgs.capture.names import find_files
 from blitzgs.capture.transforms_lens import FIELDS, read_lens
@@ -207,4 +207,4 @@ def _read_pose(matrix: object) -> Float64:
             raise ValueError("transform_matrix is not a rotation and a translation")
         if np.linalg.det(rotation) < 0:
             raise ValueError("transform_matrix mirrors the scene: one of its axes has the wrong sign")
-    return pose_of(rotation, camera_to_world[:3, 3])
+    return pose_of(nearest_rotation(rotation), camera_to_world[:3, 3])

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,13 +19,15 @@ import numpy as np
 
 from blitzgs.capture.cameras import Float64
 from blitzgs.capture.fields import read_small
-from blitzgs.util.errors import optional_package
+from blitzgs.util.errors import optional_package, warn
 
 # The file of a run, and of a capture whose world its own files do not say.
 GEO = "geo.json"
 GEOCENTRIC = "EPSG:4978"
 # The smaller spread of points, as a share of the larger, from which a similarity has no free turn left.
 _LEAST_WIDTH = 1e-3
+# UTM stretches lengths by less even in the zones beside the right one.
+_MOST_STRETCH = 0.02
 # WGS 84: the major axis in metres, and the square of the eccentricity.
 _AXIS, _E2 = 6378137.0, (2 - 1 / 298.257223563) / 298.257223563
 
@@ -123,12 +126,22 @@ def frame_beside(root: Path) -> WorldFrame | None:
     """Return the frame that a file in the folder of a capture gives; None: there is no such file.
 
     It is `geo.json`, or an offset (`offset.xyz`, `*_offset.xyz` or `offset.txt`: three numbers to add), with
-    the reference system in a `.prj` beside it, if there is one. ValueError: the file is damaged.
+    the reference system in a `.prj` beside it, if there is one, whose name begins alike if there are several.
+    ValueError: the file is damaged, or there are several offsets or reference systems.
     """
     if (root / GEO).is_file():
         return read_world_frame(root / GEO)
     paths = sorted({*root.glob("*offset.xyz"), *root.glob("offset.txt")})
-    return read_offset(paths[0], sorted(root.glob("*.prj"))) if paths else None
+    if not paths:
+        return None
+    # Shapefiles of the site have a .prj of their own.
+    every, begin = sorted(root.glob("*.prj")), re.sub(r"_?offset\.\w+$", "", paths[0].name)
+    systems = [path for path in every if path.name.startswith(begin)] or every
+    for several in (paths, systems):
+        if len({read_small(path).strip() for path in several}) > 1:
+            shown = ", ".join(path.name for path in several[:5])
+            raise ValueError(f"{root}: {shown} differ, and one says where the capture lies: keep that one")
+    return read_offset(paths[0], systems)
 
 
 def read_offset(path: Path, prj: list[Path]) -> WorldFrame:
@@ -189,20 +202,46 @@ def reference_system(crs: str) -> Any:
         raise ValueError(f"{crs!r:.60} is no reference system: name one such as EPSG:32633") from error
 
 
+def _with_heights(crs: str) -> Any:
+    """Return a reference system that has heights, above the ellipsoid and in the unit of its lengths."""
+    system = reference_system(crs).to_3d()
+    if not system.is_projected or system.is_compound:
+        return system
+    content = system.to_json_dict()
+    axes = content["coordinate_system"]["axis"]
+    axes[2]["unit"] = axes[0]["unit"]
+    return type(system).from_json_dict(content)
+
+
 def converted(positions: Float64, source: Any, target: Any) -> Float64:
     """Return positions [N, 3] of one reference system in another one, x east and y north.
 
+    A system of two axes has heights above the ellipsoid, in its own unit. Warns if grids are missing.
     ImportError: pyproj is not installed. ValueError: a system is unknown, or a position has no coordinates in
     it.
     """
     pyproj = optional_package("pyproj", "geo", "this")
+    systems = [_with_heights(system) for system in (source, target)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # ours says what to do
+        ways = pyproj.transformer.TransformerGroup(*systems, always_xy=True)
     try:
-        transformer = pyproj.Transformer.from_crs(source, target, always_xy=True)
+        transformer = pyproj.Transformer.from_crs(*systems, always_xy=True)
         moved = np.stack(transformer.transform(*positions.T, errcheck=True), axis=1)
     except pyproj.exceptions.ProjError as error:
         raise ValueError(f"from {source} to {target}: {error}") from error
     if not np.isfinite(moved).all():
         raise ValueError(f"{positions[0].tolist()} of {source} has no coordinates in {target}")
+    if not ways.best_available:
+        grids = ", ".join(grid.short_name for grid in ways.unavailable_operations[0].grids)
+        accuracy = ways.transformers[0].accuracy
+        within = (
+            f"are right to {accuracy:g} m" if accuracy >= 0 else "may be wrong by 100 m, above all in height"
+        )
+        warn(
+            f"from {systems[0].name} to {systems[1].name}, places {within}, as grids of the exact conversion "
+            f"are missing ({grids}): fetch them with pyproj sync --file NAME"
+        )
     return moved
 
 
@@ -220,15 +259,24 @@ def frame_in(frame: WorldFrame, crs: str, places: Float64) -> tuple[WorldFrame, 
         )
     if not frame.crs:
         raise ValueError("the present world has no reference system, so it cannot be converted: use --gcp")
-    # The height counts too: a system of two axes keeps it above the ellipsoid.
-    old, new = reference_system(frame.crs).to_3d(), wanted.to_3d()
+    if len({axis.unit_name for axis in wanted.axis_info}) > 1:
+        raise ValueError(
+            f"{crs} ({wanted.name}) has heights in another unit than lengths: name one with both in one unit"
+        )
     around = places.mean(axis=0) + np.ptp(places, axis=0).max() * 0.1 * np.concatenate(
         [np.eye(3), -np.eye(3)]
     )
     every = np.concatenate([places, around])
-    target = converted(frame.to_world(every), old, new)
+    target = converted(frame.to_world(every), frame.crs, crs)
     found = fit_similarity(every, target, crs, f"{frame.source}, converted from {frame.name}")
     largest = np.linalg.norm(found.to_world(places) - target[: len(places)], axis=1).max()
+    units = [reference_system(name).axis_info[0].unit_conversion_factor for name in (frame.crs, crs)]
+    stretch = found.scale * units[1] / (frame.scale * units[0])
+    if abs(stretch - 1) > _MOST_STRETCH:
+        warn(
+            f"lengths in {crs} ({wanted.name}) are {stretch:.3g} times those on the ground at this place: "
+            "name a system that is made for it, such as its UTM zone"
+        )
     return found, float(largest)
 
 

@@ -30,6 +30,8 @@ from blitzgs.util.errors import printable, warn
 
 # -1 for photographs that look straight down, or level; -1.4 between the two.
 _TURNED_OVER = 0.3
+# Cameras are around the origin if it is nearer than so many times their spread.
+_LOCAL = 5.0
 
 HELP = """\
 Find out where the model of a run lies in the world, and write that to RUN/geo.json, which `blitzgs view` and
@@ -131,21 +133,18 @@ def _by_gps(args: argparse.Namespace, capture: Capture) -> WorldFrame:
         raise ValueError(f"{len(some)} of {len(known)} photographs have a GPS position, and 3 are needed")
     world = np.array([known[index] for index in some])
     centres = _centres(capture)[some]
-    target = args.crs or GEOCENTRIC
-    if args.crs:
-        _check_lengths(args.crs)
-    system = reference_system(target).to_3d()
-    moved = converted(world, "EPSG:4979", system)
-    frame = fit_similarity(centres, moved, target, f"EXIF GPS of {len(some)} photographs")
+    moved = converted(world, "EPSG:4979", GEOCENTRIC)
+    frame = fit_similarity(centres, moved, GEOCENTRIC, f"EXIF GPS of {len(some)} photographs")
     apart = np.linalg.norm(frame.to_world(centres) - moved, axis=1)
     # A receiver errs by metres: those far beyond the others are left out once.
     good = apart <= 4 * np.median(apart) + 1e-9
     if good.sum() >= 3:
-        frame = fit_similarity(centres[good], moved[good], target, f"EXIF GPS of {good.sum()} photographs")
+        source = f"EXIF GPS of {good.sum()} photographs"
+        frame = fit_similarity(centres[good], moved[good], GEOCENTRIC, source)
     apart = np.linalg.norm(frame.to_world(centres[good]) - moved[good], axis=1)
     print(f"{good.sum()} of {len(known)} positions used; distances: median {np.median(apart):.2f} m, largest "
           f"{apart.max():.2f} m")  # fmt: skip
-    return frame
+    return _in_system(frame, args.crs, capture) if args.crs else frame
 
 
 def _centres(capture: Capture) -> Float64:
@@ -158,10 +157,26 @@ def _converted(args: argparse.Namespace, capture: Capture) -> WorldFrame:
     if known is None or not known.crs:
         _check_lengths(args.crs)
         frame = known or WorldFrame()
+        _warn_if_local(frame.to_world(_centres(capture))[:, :2], args.crs)
         source = frame.source or "the capture's own coordinates"
         return dataclasses.replace(frame, crs=args.crs, source=source)
+    return _in_system(known, args.crs, capture)
+
+
+def _warn_if_local(places: Float64, crs: str) -> None:
+    """Warn of cameras [N, 2] around the origin of a reference system, which is far from most sites."""
+    middle = places.mean(axis=0)
+    if np.linalg.norm(middle) < _LOCAL * np.ptp(places, axis=0).max():
+        east, north = middle.tolist()
+        warn(
+            f"the cameras lie around E {east:.6g} N {north:.6g} of {crs}: if these are the capture's own "
+            "coordinates, find the world by --gcp or --gps"
+        )
+
+
+def _in_system(frame: WorldFrame, crs: str, capture: Capture) -> WorldFrame:
     some = capture.points[:: max(1, len(capture.points) // 1000)] + capture.offset
-    places = np.concatenate([_centres(capture), some])
-    frame, error = frame_in(known, args.crs, places)
-    print(f"a similarity for the projection is wrong by at most {error:.3g} m at the cameras and points")
-    return frame
+    found, error = frame_in(frame, crs, np.concatenate([_centres(capture), some]))
+    unit = reference_system(crs).axis_info[0].unit_name.replace("metre", "m")
+    print(f"a similarity for the projection is wrong by at most {error:.3g} {unit} at the cameras and points")
+    return found

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import re
 import shlex
@@ -19,7 +20,7 @@ from blitzgs.cli.arguments import DATA, DEVICE, MODEL, Commands, Types, add_argu
 from blitzgs.cli.view import photographs
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import GaussianSource, check_memory, is_antialiased, triple_of
-from blitzgs.formats.models import FORMATS, Format, check_replaces, offset_of, open_gaussians
+from blitzgs.formats.models import FORMATS, Format, check_replaces, offset_of, open_gaussians, system_of
 from blitzgs.formats.selection import Selected, Selection, read_polygon
 from blitzgs.formats.web_page import check_replaces_page
 from blitzgs.runs.cameras import stored_cameras
@@ -184,6 +185,8 @@ def _export_tiles(args: argparse.Namespace, selection: Selection | None) -> None
     )
     if beside is not None:
         print(f"coordinates are relative to ({x!r}, {y!r}, {z!r}), as {beside} says")
+    elif args.tiles and not (city.frame and city.frame.crs) and math.hypot(x, y, z) > 2 * city.extent:
+        print(f"the tiles lie around ({x!r}, {y!r}, {z!r}); `blitzgs align RUN --crs` puts them on the globe")
     for line in FORMATS["spz"].told(written.lost):
         print(line, file=sys.stderr)
     if args.tiles and not args.spz_tiles:
@@ -226,9 +229,10 @@ def _export_file(args: argparse.Namespace) -> None:
         if path.exists() and path.samefile(args.model):
             raise ValueError(f"{path} is the model itself, which would be lost: choose another name")
         source = open_gaussians(args.model, checked=selection is None)
+        crs = system_of(args.model, source)
         with image_progress("Exporting", unit="Gaussians") as report:
             source = _chosen(source, report, selection, offset_of(source.comments))
-            written = export_file(source, kind, path)
+            written = export_file(source, kind, path, crs)
     else:
         source, written = _export_run(args, kind, path, selection)
     count = len(source) - written.lost.left_out

@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -35,6 +36,7 @@ class Format:
     harmonics: bool = True  # whether it holds SH coefficients beyond the DC
     quantised: bool = True  # whether positions are finer near the origin than float32 makes them
     ranges: str = ""  # to which `write` cuts values
+    position: str = "coordinates in the file"  # what, plus the offset, are the model's coordinates
 
     def unstated(self, source: GaussianSource) -> list[str]:
         """Return what a viewer of the file will not know of a model, each a sentence without a full stop."""
@@ -79,9 +81,13 @@ FORMATS = {
     "spz": Format(
         "SPZ", ".spz", packed.read_spz, packed.write_spz, (b"\x1f\x8b", b"NGSP"), ("antialiasing",),
         ranges="scales of 0.000045 to 379 units, colours to 1.44 of white and SH coefficients to 1",
+        position="(x, -y, -z) of the coordinates in the file",
     ),
     "sog": Format("SOG", ".sog", read_sog, write_sog, (b"PK",), ("antialiasing",)),
-    "glb": Format("GLB", ".glb", None, write_glb, (b"glTF",), ("levels",), quantised=False),
+    "glb": Format(
+        "GLB", ".glb", None, write_glb, (b"glTF",), ("levels",), quantised=False,
+        position="coordinates in the file, without the turn of its node,",
+    ),
 }  # fmt: skip
 
 
@@ -154,12 +160,26 @@ def offset_file(path: Path) -> Path:
 
 def stated_offset(path: Path) -> tuple[float, float, float] | None:
     """Return the offset in an `offset_file`; None: there is none, or another program wrote the file."""
+    content = _stated(path)
+    return None if content is None else content["offset"]
+
+
+def system_of(path: Path, source: GaussianSource) -> str | None:
+    """Return the reference system of a file's model, empty if it is unknown; None: it is not in the world."""
+    content = _stated(offset_file(path))
+    if content is None or content["offset"] != offset_of(source.comments):
+        return None
+    return content["crs"] if content["meaning"].startswith("world") else None
+
+
+def _stated(path: Path) -> dict[str, Any] | None:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         x, y, z = (float(value) for value in content["offset"])
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        texts = {name: str(content[name]) for name in ("file", "meaning")}
+        return {**texts, "offset": (x, y, z), "crs": str(content.get("crs", ""))}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return None
-    return (x, y, z) if {"file", "meaning"} <= content.keys() else None
 
 
 def offset_of(comments: list[str]) -> tuple[float, float, float]:

@@ -29,6 +29,8 @@ from blitzgs.util.output import check_replaceable, new_file
 LEVEL = "level"
 # Positions may be rounded by this share of the median Gaussian's middle axis.
 MAX_ROUNDING = 0.01
+# The positions of points may be rounded by this share of the cloud's longest side.
+_LARGEST_STEP = 1e-4
 
 
 def _property_names(coefficients: int) -> list[str]:
@@ -242,7 +244,9 @@ def read_point_cloud(path: Path | str) -> PointCloud:
     def columns(names: Sequence[str]) -> npt.NDArray[Any]:
         return np.stack([table[stored[name]] for name in names], axis=1)
 
-    positions, every = columns("xyz").astype(np.float64), table.dtype.names or ()
+    positions, every = columns("xyz"), table.dtype.names or ()
+    _check_steps(positions, path)
+    positions = positions.astype(np.float64)
     names = next((names for names in _COLORS if set(names) <= stored.keys()), None)
     if names is not None:
         return PointCloud(positions, _color_bytes(columns(names), path), ", ".join(names), every)
@@ -252,6 +256,19 @@ def read_point_cloud(path: Path | str) -> PointCloud:
         colors = (np.clip(fractions, 0, 1) * 255 + 0.5).astype(np.uint8)
         return PointCloud(positions, colors, "f_dc_0 to f_dc_2", every)
     return PointCloud(positions, np.full((len(table), 3), _GREY, dtype=np.uint8), "", every)
+
+
+def _check_steps(positions: npt.NDArray[Any], path: Path | str) -> None:
+    """Warn of positions [N, 3] that are too far from the origin for the digits of their dtype."""
+    finite = positions[np.isfinite(positions).all(axis=1)]
+    if finite.dtype.kind != "f" or len(finite) < 2:
+        return
+    step, size = float(np.spacing(np.abs(finite).max())), float(np.ptp(finite, axis=0).max())
+    if step > _LARGEST_STEP * size > 0:
+        warn(
+            f"{path}: its {finite.dtype} positions are rounded to {step:.2g}, so far from the origin are the "
+            "points: export them as double, or in the local coordinates of the cameras"
+        )
 
 
 def _color_bytes(colors: npt.NDArray[Any], path: Path | str) -> npt.NDArray[np.uint8]:

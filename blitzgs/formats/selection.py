@@ -90,7 +90,10 @@ class Selected:
             self._met[chosen[order[selection.most :]]] = False
         self._count = int(self._met.sum())
         if self._count == 0:
-            raise ValueError("no Gaussian meets the conditions: choose a larger region, or lower limits")
+            raise ValueError(
+                "no Gaussian meets the conditions: choose a larger region, or lower limits"
+                + _where(source, np.array(origin))
+            )
 
     def __len__(self) -> int:
         return self._count
@@ -103,6 +106,17 @@ class Selected:
             first += len(block)
             if len(chosen):
                 yield replace(chosen, sh=chosen.sh[:, : (self.degree + 1) ** 2])
+
+
+def _where(source: GaussianSource, origin: Array) -> str:
+    """Return where the Gaussians lie, [3] to [3], as the end of an error: regions may be of other systems."""
+    means = (block.means[block.sound()] for block in source.blocks())
+    ends = [some.aminmax(dim=0) for some in means if len(some)]
+    if not ends:
+        return ""
+    least, largest = torch.stack([e.min for e in ends]).amin(0), torch.stack([e.max for e in ends]).amax(0)
+    corners = (", ".join(f"{x:.9g}" for x in end.numpy() + origin) for end in (least, largest))
+    return "; the model is from ({}) to ({})".format(*corners)
 
 
 def opacity_length(opacities: Tensor, scales: Tensor) -> Tensor:
@@ -138,9 +152,12 @@ def read_polygon(path: Path) -> Array:
                 if len(content.get("features", [0])) != 1:
                     raise ValueError(f"it has {len(content['features'])} features: leave one")
                 content = content["features"][0] if "features" in content else content["geometry"]
-            if content["type"] != "Polygon" or len(content["coordinates"]) != 1:
-                raise ValueError("it is no polygon without holes")
-            rows = [corner[:2] for corner in content["coordinates"][0]]
+            kind, rings = content["type"], content["coordinates"]
+            if kind == "MultiPolygon" and len(rings) == 1:  # as QGIS writes all polygons
+                kind, rings = "Polygon", rings[0]
+            if kind != "Polygon" or len(rings) != 1:
+                raise ValueError("it is no single polygon without holes")
+            rows = [corner[:2] for corner in rings[0]]
         else:
             lines = (line.replace(",", " ").split() for line in text.splitlines())
             rows = [line for line in lines if line and not line[0].startswith("#")]

@@ -75,7 +75,7 @@ def export(
     if coordinates == "auto" and kind.quantised:
         centred |= float(np.linalg.norm(offset)) > 2 * space.extent * space.unit
     if centred:
-        sidecar, lost = _write(source, np.zeros(3), space.offset, kind.write, path, crs)
+        sidecar, lost = _write(source, np.zeros(3), space.offset, kind.write, path, kind.position, crs)
         return Exported(space.offset, sidecar, 0.0, lost or Lost())
     _, lost = _write(source, offset, None, kind.write, path)
     return Exported(None, None, rounding, lost or Lost())
@@ -98,10 +98,10 @@ def export_folder(
     return _write(source, shift, offset if centred else None, write, path)[0]
 
 
-def export_file(source: GaussianSource, kind: Format, path: Path) -> Exported:
+def export_file(source: GaussianSource, kind: Format, path: Path, crs: str | None = None) -> Exported:
     """Write the model of a file, with its offset; where it is far from the origin, with one that is near it.
 
-    ValueError, OSError: as `export`.
+    `crs`, ValueError, OSError: as for `export`.
     """
     check_replaces(path, kind)
     offset, shift = np.array(offset_of(source.comments)), np.zeros(3)
@@ -112,7 +112,7 @@ def export_file(source: GaussianSource, kind: Format, path: Path) -> Exported:
             shift = np.round((low + high) / 2)
     x, y, z = (offset + shift).tolist()
     stated = (x, y, z) if offset.any() or shift.any() else None
-    sidecar, lost = _write(source, -shift, stated, kind.write, path)
+    sidecar, lost = _write(source, -shift, stated, kind.write, path, kind.position, crs)
     return Exported(stated, sidecar, 0.0, lost or Lost())
 
 
@@ -122,11 +122,13 @@ def _write(
     offset: tuple[float, float, float] | None,
     write: Callable[[Path, GaussianSource], T],
     path: Path,
+    position: str = Format.position,
     crs: str | None = None,
 ) -> tuple[Path | None, T]:
     """Write Gaussians moved by `shift`; return the file beside, and what `write` returns.
 
-    If they are around an offset, header and the file beside state it; else there is none.
+    If they are around an offset, header and the file beside state it, the latter with `Format.position`; else
+    there is none.
     """
     sidecar = offset_file(path)
     lines = [line for line in source.comments if offset_of([line]) == (0, 0, 0)]
@@ -147,7 +149,7 @@ def _write(
         if stated_offset(sidecar) is not None:
             sidecar.unlink()
         return None, found
-    meaning = f"{'capture' if crs is None else 'world'} coordinates = coordinates in the file + offset"
+    meaning = f"{'capture' if crs is None else 'world'} coordinates = {position} + offset"
     content = {"file": path.name, "offset": offset, "meaning": meaning}
     write_file(sidecar, json.dumps(content | ({"crs": crs} if crs else {}), indent=1))
     return sidecar, found

@@ -75,6 +75,13 @@ class Photographs:
         """
         files = files_below(folder) if folder.is_dir() else [folder.name]
         names = _photographs_of(files) if folder.is_dir() else []
+        # A folder may be called Alpha after the camera.
+        images = (name for name in files if name.lower().endswith(IMAGE_SUFFIXES))
+        if maps := [name for name in images if _BY_PRODUCT.search(name) and "mask" not in name.lower()]:
+            warn(
+                f"{folder}: {len(maps)} images are called like maps of depth, alpha or the like, and are "
+                f"left out (first: {maps[0]}); if they are photographs, call their folder or them otherwise"
+            )
         # Many cameras write a photograph as JPEG and as raw data beside it.
         known = {PurePosixPath(name).with_suffix("") for name in names}
         others = to_convert(name for name in files if PurePosixPath(name).with_suffix("") not in known)

@@ -211,6 +211,7 @@ def refine(job: dict[str, Any]) -> None:
     model = pycolmap.Reconstruction(job["model"])
     posed = [image for image in model.images.values() if image.has_pose]
     before = np.stack([image.projection_center() for image in posed])
+    model.normalize()  # far from the origin, turns and shifts of a camera are hardly told apart
     counts = Counter(image.camera_id for image in posed)
     few = [number for number in model.cameras if counts[number] < MANY]
     scale = max(job["miss"], _LEAST_SCALE)

@@ -28,6 +28,7 @@ from blitzgs.util.errors import printable, warn
 _DECODED, _PROJECTED = 16, 100
 # Means of a photograph or of all points' colours, of 255, from which it is black or saturated.
 _BLACK, _SATURATED = 4.0, 251.0
+_DIM = 16.0  # white of 12 bits in a file of 16: a photograph with hardly a brighter pixel is black
 # The brightness of points and of the pixels that show them correlates by 0.5 to 0.95, with another photograph
 # or a turned or cropped one by -0.2 to 0.2; among points that are mostly hidden, both are less. The least
 # number of points, the least correlation, and its least share of that of the other photographs.
@@ -48,6 +49,7 @@ class Pictures:
     """Figures of some photographs."""
 
     means: list[float]  # mean of each, over the pixels that count, 0 to 255
+    black: list[bool]  # whether hardly one of these pixels is brighter
     masked: list[float]  # share of each that its mask excludes, of those with a mask
     unread: list[str]  # what is wrong with those that could not be decoded
     likeness: dict[str, float]  # correlation with the points' brightness, by name; NaN: unknown
@@ -97,7 +99,7 @@ def _look(capture: Capture, images: ImageStore) -> Pictures:
     """Decode some photographs, evenly chosen; a damaged one is left to the reader that needs it."""
     some = capture.train[:: -(-len(capture.train) // _DECODED)]
     images.prefetch(some)
-    pictures = Pictures([], [], [], {})
+    pictures = Pictures([], [], [], [], {})
     points, colors = (sampled(column, len(capture.cameras)) for column in (capture.points, capture.colors))
     for index in some:
         try:
@@ -111,13 +113,13 @@ def _look(capture: Capture, images: ImageStore) -> Pictures:
         pictures.likeness[camera.name] = _likeness(camera, image, mask, points, colors)
         step = max(1, min(image.shape[:2]) // 256)
         pixels = image[::step, ::step]
-        if mask is None:
+        if mask is not None:
+            counts = mask.numpy()[::step, ::step] > 0
+            pictures.masked.append(1 - float(counts.mean()))
+            pixels = pixels[counts]
+        if pixels.size:
             pictures.means.append(float(pixels.mean()))
-            continue
-        counts = mask.numpy()[::step, ::step] > 0
-        pictures.masked.append(1 - float(counts.mean()))
-        if counts.any():
-            pictures.means.append(float(pixels[counts].mean()))
+            pictures.black.append(pictures.means[-1] < _BLACK or np.quantile(pixels, 0.99) < _DIM)
     return pictures
 
 
@@ -143,7 +145,7 @@ def _warn_of_pictures(capture: Capture, pictures: Pictures, near: float) -> None
     """Warn if most photographs, the colours of the points, or most views give a black or white picture."""
     means = np.array(pictures.means)
     for what, hit, cause in (
-        ("black", means < _BLACK, "is their alpha 0 everywhere, or is their range below 8 bits?"),
+        ("black", np.array(pictures.black), "is their alpha 0 everywhere, or do 16 bits hold 12 or 10?"),
         ("saturated", means > _SATURATED, "are they overexposed, or is model.background white behind alpha?"),
     ):
         if 2 * hit.sum() > len(means):

@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
-from blitzgs.capture.world import GEOCENTRIC, WorldFrame, converted, reference_system
+from blitzgs.capture.world import GEOCENTRIC, WorldFrame, converted
 from blitzgs.config.files import changed
 from blitzgs.distributed.group import Ranks
 from blitzgs.formats.gaussians import Gaussians, GaussianSource, up_of
-from blitzgs.formats.models import offset_of, open_gaussians, with_degree
+from blitzgs.formats.models import offset_of, open_gaussians, system_of, with_degree
 from blitzgs.formats.selection import opacity_length
 from blitzgs.formats.tiles import upright
 from blitzgs.formats.web_page import WebLevels, WebScene, estimated_bytes, frame_bytes, web_page
@@ -190,6 +190,8 @@ def open_city(path: Path, checked: bool = True) -> City:
     if path.is_file():
         source: GaussianSource = open_gaussians(path, checked)
         offset = np.array(offset_of(source.comments))
+        if crs := system_of(path, source):
+            frame = WorldFrame(crs, source=path.name)
     else:
         folder, checkpoint = run_files.run_and_checkpoint(path)
         run = open_source(folder, checkpoint)
@@ -225,7 +227,7 @@ def to_globe(frame: WorldFrame, origin: Array) -> Array:
     step = 10.0
     places = origin + step * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     with located(frame.source):
-        globe = converted(frame.to_world(places), reference_system(frame.crs).to_3d(), GEOCENTRIC)
+        globe = converted(frame.to_world(places), frame.crs, GEOCENTRIC)
     matrix = np.eye(4)
     matrix[:3, :3] = (globe[1:4] - globe[4:]).T / (2 * step)
     matrix[:3, 3] = globe[0]

@@ -12,6 +12,7 @@ from blitzgs.capture.cameras import rectify
 from blitzgs.capture.capture import load_capture
 from blitzgs.capture.lengths import NEAR_OF_EXTENT
 from blitzgs.capture.lens import Lens
+from blitzgs.capture.projects import rotation_of
 from tests.capture.helpers import as_text, at, frame, smooth_image, write_image, write_ply, write_transforms
 from tests.helpers import look_at_origin, refused, write_colmap
 
@@ -110,6 +111,19 @@ def test_an_overview_that_shows_the_scene_is_kept_but_decides_on_no_length(tmp_p
     capture, said = quiet_load(tmp_path)
     assert len(capture.cameras) == COUNT and capture.apart == [STRAY] and capture.extent < 6
     assert not capture.about.strays and not said
+
+
+def test_rotations_of_few_digits_keep_lengths_far_from_the_origin(tmp_path):
+    """At 5,200 km, the fifth digit of a rotation is 50 m of a camera centre."""
+    rotations, centres, points = ring(UTM)
+    write(tmp_path / "exact", "transforms", rotations, centres, points)
+    write(tmp_path / "rounded", "transforms", np.round(rotations, 5), centres, points)
+    exact, rounded = (quiet_load(tmp_path / name)[0] for name in ("exact", "rounded"))
+    assert rounded.extent == pytest.approx(exact.extent, rel=1e-4)
+    np.testing.assert_allclose(rounded.offset, exact.offset, atol=1e-4)
+    np.testing.assert_allclose(rotation_of(np.round(rotations[1], 5)), rotations[1], atol=1e-5)
+    turn = rotation_of(np.round(rotations[1], 5))
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-14)
 
 
 def test_two_groups_of_cameras_are_no_strays(tmp_path):

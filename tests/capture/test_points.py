@@ -4,8 +4,10 @@
 import json
 import re
 import shutil
+import warnings
 
 import numpy as np
+import plyfile
 import pytest
 
 from blitzgs.capture import colmap
@@ -13,6 +15,7 @@ from blitzgs.capture.capture import load_capture
 from blitzgs.capture.layouts import read_layout
 from blitzgs.capture.points import file_points
 from blitzgs.formats.ply import read_point_cloud
+from blitzgs.training import understood
 from tests.capture import helpers as files
 from tests.capture.helpers import as_text, frame, warned, write_capture, write_ply, write_transforms
 from tests.helpers import refused
@@ -181,6 +184,22 @@ def test_a_ply_beside_the_points_of_the_model_is_not_used(tmp_path):
 UTM = np.array([412_345.0, 5_654_321.0, 120.0])
 
 
+@pytest.mark.parametrize(("kind", "local"), [("f4", False), ("f8", False), ("f4", True)])
+def test_points_that_float32_rounds_are_named(tmp_path, kind, local):
+    capture = files.Posed(origin=np.zeros(3) if local else UTM)
+    rows = np.zeros(len(capture.points), [(axis, kind) for axis in "xyz"])
+    for axis, column in zip("xyz", capture.points.T, strict=True):
+        rows[axis] = column
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(tmp_path / "p.ply")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        file_points(tmp_path / "p.ply")
+    rounded = [
+        str(w.message) for w in caught if "p.ply: its float32 positions are rounded to 0.5" in str(w.message)
+    ]
+    assert len(rounded) == (kind == "f4" and not local)
+
+
 def write_las(path, positions, colors=None, crs=None):
     laspy = pytest.importorskip("laspy")
     header = laspy.LasHeader(point_format=3 if colors is not None else 0, version="1.4" if crs else "1.2")
@@ -222,19 +241,43 @@ def test_e57_applies_the_pose_of_each_scan(tmp_path):
     np.testing.assert_array_equal(found.colors, capture.colors)
 
 
-def test_points_of_another_reference_system_are_moved_to_the_cameras(tmp_path):
-    """Metashape's cameras are in a chunk's coordinates, its points in UTM."""
+@pytest.mark.parametrize(
+    ("at", "crs", "foot"), [((47.5, 8.25), "EPSG:32632", 1), ((37.5, -122.0), "EPSG:2227", 1200 / 3937)]
+)
+def test_points_of_another_reference_system_are_moved_to_the_cameras(tmp_path, at, crs, foot):
+    """Metashape's cameras are in a chunk's coordinates, its points in UTM, or in feet."""
     pyproj = pytest.importorskip("pyproj")
-    place = np.array(pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978").transform(47.5, 8.25, 432.0))
+    place = np.array(pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978").transform(*at, 432.0))
     capture = files.Posed(origin=place)
     chunk, scale, shift = files.metashape(capture, capture.write_images(tmp_path) / "cameras.xml")
-    utm = pyproj.Transformer.from_crs("EPSG:4978", pyproj.CRS("EPSG:32632").to_3d()).transform(
-        *capture.points.T
-    )
-    write_las(tmp_path / "cloud.las", np.stack(utm, axis=1), capture.colors, pyproj.CRS("EPSG:32632"))
+    moved = pyproj.Transformer.from_crs("EPSG:4978", pyproj.CRS(crs).to_3d()).transform(*capture.points.T)
+    rows = np.stack(moved, axis=1) / [1, 1, foot]  # pyproj's heights are in metres
+    write_las(tmp_path / "cloud.las", rows, capture.colors, pyproj.CRS(crs))
     _, points, _ = read_layout(tmp_path, "images", 1)
     local = (capture.points - shift) @ chunk / scale
     np.testing.assert_allclose(points.positions, local, atol=2e-4)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:4979"])
+def test_points_without_a_reference_system_have_that_of_the_project(tmp_path, crs):
+    """Metashape exports PLY in the chunk's reference system, which only its XML states."""
+    pyproj = pytest.importorskip("pyproj")
+    place = np.array(pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978").transform(47.5, 8.25, 432.0))
+    capture = files.Posed(origin=place)
+    path = capture.write_images(tmp_path) / "cameras.xml"
+    chunk, scale, shift = files.metashape(capture, path)
+    system = pyproj.CRS(crs).to_3d()
+    wkt = pyproj.CRS(crs).to_wkt("WKT2_2019" if crs == "EPSG:4979" else "WKT1_GDAL")
+    path.write_text(
+        re.sub("<reference>.*</reference>", lambda _: f"<reference>{wkt}</reference>", path.read_text())
+    )
+    moved = pyproj.Transformer.from_crs("EPSG:4978", system, always_xy=True).transform(*capture.points.T)
+    write_ply(tmp_path / "cloud.ply", np.stack(moved, axis=1), capture.colors)
+    loaded = warned(f"the points are in coordinates of {system.name}", read_layout, tmp_path, "images", 1)
+    np.testing.assert_allclose(loaded[1].positions, (capture.points - shift) @ chunk / scale, atol=2e-4)
+    write_ply(tmp_path / "cloud.ply", np.stack(moved, axis=1) + [1e9, 0, 0], capture.colors)
+    with pytest.raises(ValueError, match="see none of the"):
+        understood.check_worlds(load_capture(tmp_path))
 
 
 def test_points_in_world_coordinates_and_cameras_without_the_offset(tmp_path):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Projects of other programs give the pixels, points and world of the capture that they were written from."""
 
+import re
 import shutil
 
 import numpy as np
@@ -80,20 +81,31 @@ def test_metashape_fisheye(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("separator", "header"),
-    [(",", "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"),
-     (";", "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2")],
+    ("separator", "mark", "header"),
+    [(",", ".", "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"),
+     (";", ".", "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"),
+     (";", ",", "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2")],
 )  # fmt: skip
-def test_realitycapture_with_the_points_of_a_bundle(tmp_path, separator, header):
+def test_realitycapture_with_the_points_of_a_bundle(tmp_path, separator, mark, header):
     capture = files.Posed(origin=UTM)
     path = capture.write_images(tmp_path) / "registration.csv"
     files.realitycapture(capture, path, header)
-    path.write_text(path.read_text().replace(",", separator))
+    text = re.sub(r"(?<=[0-9])[.](?=[0-9])", mark, path.read_text().replace(",", separator))
+    path.write_text(text)
     files.bundler(capture, tmp_path / "bundle.out")
     views, points, source = read(tmp_path)
     assert residual(capture, views) < 1e-4
     np.testing.assert_allclose(points.positions, capture.points, atol=1e-8)
     assert source.cameras == "registration.csv (RealityCapture)"
+
+
+@pytest.mark.parametrize("letters", ["utf-8", "utf-8-sig", "cp1252"])
+def test_names_with_umlauts_are_read_as_windows_and_others_write_them(tmp_path, letters):
+    capture = files.Posed(names=[f"Fl\u00e4che {i}.JPG" for i in range(6)])
+    path = capture.write_images(tmp_path) / "registration.csv"
+    files.realitycapture(capture, path)
+    path.write_text(path.read_text("utf-8-sig"), encoding=letters)
+    assert [camera.name for camera in load_capture(tmp_path).cameras] == capture.names
 
 
 def test_realitycapture_angles_are_those_of_its_help(tmp_path):
@@ -124,8 +136,12 @@ def test_realitycapture_in_degrees_is_refused(tmp_path):
 
 
 def test_bundler(tmp_path):
-    capture = files.Posed(cx=files.WIDTH / 2, cy=files.HEIGHT / 2, k=(-0.1, 0.02, 0.0), p=(0.0, 0.0))
+    names = [f"Flug 0 {i}.JPG" for i in range(6)]
+    middle = {"cx": files.WIDTH / 2, "cy": files.HEIGHT / 2}
+    capture = files.Posed(names=names, k=(-0.1, 0.02, 0.0), p=(0.0, 0.0), **middle)
     files.bundler(capture, capture.write_images(tmp_path) / "bundle.out")
+    listed = tmp_path / "list.txt"  # a line may have the focal length
+    listed.write_text(listed.read_text().replace("0 2.JPG", "0 2.JPG 0 1234.5"))
     views, points, source = read(tmp_path)
     assert residual(capture, views) < 1e-9
     np.testing.assert_array_equal(points.positions, capture.points)

@@ -3,6 +3,7 @@
 
 import json
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from blitzgs.capture.world import (
     read_world_frame,
 )
 from tests.capture import helpers as files
+from tests.capture.helpers import warned
 from tests.helpers import refused
 
 TURN = Rotation.from_euler("xyz", [10, -70, 130], degrees=True).as_matrix()
@@ -67,6 +69,20 @@ def test_the_file_keeps_every_digit(tmp_path):
     assert found.crs == "EPSG:32633" and found.scale == 1 / 3
     np.testing.assert_array_equal(found.translation, frame.translation)
     np.testing.assert_array_equal(found.rotation, TURN)
+
+
+def test_an_offset_has_the_reference_system_of_its_name(tmp_path):
+    """Shapefiles of a site have a .prj of their own."""
+    (tmp_path / "site_offset.xyz").write_text("412345 5654321 100\n")
+    (tmp_path / "site_wkt.prj").write_text("EPSG:32633")
+    (tmp_path / "border.prj").write_text("EPSG:4326")
+    assert frame_beside(tmp_path).crs == "EPSG:32633"
+    (tmp_path / "site_offset.xyz").rename(tmp_path / "offset.txt")
+    refused(ValueError, "border.prj, site_wkt.prj differ, .* keep that one", frame_beside, tmp_path)
+    (tmp_path / "border.prj").unlink()
+    assert frame_beside(tmp_path).crs == "EPSG:32633"
+    (tmp_path / "other_offset.xyz").write_text("1 2 3")
+    refused(ValueError, "offset.txt, other_offset.xyz differ", frame_beside, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -122,6 +138,42 @@ def test_a_frame_in_utm_is_right_within_its_stated_error():
     refused(ValueError, "'EPSG:0' is no reference system", frame_in, frame, "EPSG:0", places)
 
 
+def test_heights_are_in_the_unit_of_lengths(tmp_path):
+    """Of systems in feet, pyproj has heights in metres, with which a model would be flat."""
+    pytest.importorskip("pyproj")
+    frame = enu_frame(37.5, -122.0, 300.0, "here")
+    places = np.random.default_rng(2).uniform(-150, 150, (60, 3))
+    feet, error = frame_in(frame, "EPSG:2227", places)
+    metres, _ = frame_in(frame, "EPSG:32610", places)
+    assert feet.scale == pytest.approx(metres.scale * 3937 / 1200, rel=1e-3) and error < 0.1
+    assert feet.to_world(np.zeros(3))[2] == pytest.approx(300 * 3937 / 1200, abs=0.1)
+    assert metres.to_world(np.zeros(3))[2] == pytest.approx(300, abs=0.1)
+    back, error = frame_in(feet, "EPSG:4978", places)
+    np.testing.assert_allclose(back.to_world(places), frame.to_world(places), atol=0.1)
+    refused(ValueError, "heights in another unit", frame_in, frame, "EPSG:2227+5703", places)
+
+
+def test_a_projection_of_another_place_and_missing_grids_are_named():
+    pyproj = pytest.importorskip("pyproj")
+    frame = enu_frame(48.0, 11.5, 500.0, "here")
+    places = np.random.default_rng(2).uniform(-150, 150, (60, 3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for near in ("EPSG:25832", "EPSG:25833", "EPSG:4978"):
+            frame_in(frame, near, places)
+    warned(
+        r"lengths in EPSG:3857 .* are 1.[0-9]+ times those on the ground",
+        frame_in,
+        frame,
+        "EPSG:3857",
+        places,
+    )
+    warned("lengths in EPSG:32610 .* times those", frame_in, frame, "EPSG:32610", places)
+    if not pyproj.transformer.TransformerGroup("EPSG:4979", "EPSG:25832+7837").best_available:
+        message = r"to ETRS89 / UTM zone 32N \+ DHHN2016 height, places may be .* \(de_bkg_gcg2016.tif\)"
+        warned(message, frame_in, frame, "EPSG:25832+7837", places)
+
+
 TILT = Rotation.from_euler("xyz", [3, -8, 100], degrees=True).as_matrix()
 SHIFT = np.array([512_345.0, 5_012_345.0, 250.0])
 
@@ -164,7 +216,7 @@ def test_a_wrong_survey_and_unusable_points_are_named_and_left_out(setting):
     np.testing.assert_allclose(frame.rotation, TILT, atol=1e-9)
     problems = {p.name: p.problem for p in placed if p.problem}
     assert problems["wrong"] == "contradicts the others and is left out"
-    assert problems["single"] == "marked in fewer than 2 views (nowhere.jpg is none)"
+    assert problems["single"].startswith("marked in fewer than 2 views (nowhere.jpg is none, or")
     assert problems["narrow"].startswith("marked in fewer than 2 views")
     np.testing.assert_allclose(placed[7].offset, [-0.4, 0, -0.3], atol=1e-7)
     assert 1 < placed[7].reprojection < 20
@@ -177,6 +229,32 @@ def test_a_wrong_survey_and_unusable_points_are_named_and_left_out(setting):
     placed = place(noisy, capture.cameras, capture.offset)
     align(placed, capture.offset, "", "test")
     assert 0.2 < np.sqrt(np.mean([p.reprojection**2 for p in placed if not p.problem])) < 0.6
+
+
+def test_folders_tell_photographs_of_one_name_apart(setting):
+    """Drones count from 1 again on each flight."""
+    _, capture, points = setting
+    names = [f"Flug {1 + i % 2}/DJI_{i // 2:04d}.JPG" for i in range(len(capture.cameras))]
+    cameras = [replace(c, name=f"images/{name}") for c, name in zip(capture.cameras, names, strict=True)]
+    by_old = dict(zip((c.name for c in capture.cameras), names, strict=True))
+    exact = place(points[:1], capture.cameras, capture.offset)[0]
+
+    def placed(change, some):
+        marks = [(change(by_old[name]), x, y) for name, x, y in points[0].marks]
+        return place([ControlPoint("P", points[0].world, marks)], some, capture.offset)[0]
+
+    for change in (str, "images/{}".format, r"C:\site\{}".format, lambda name: name.upper()):
+        np.testing.assert_array_equal(placed(change, cameras).position, exact.position)
+    assert "is none, or several" in placed(lambda name: name.rpartition("/")[2], cameras).problem
+    # A mark in a photograph without a pose is not one in that of another flight.
+    first = [camera for camera in cameras if "Flug 1" in camera.name]
+    assert len(placed(str, first).seen) == len(first) < len(cameras)
+    loose = [replace(camera, name=camera.name.rpartition("/")[2]) for camera in first]
+    marks = [mark for mark in points[0].marks if "Flug 1" in by_old[mark[0]]]
+    moved = [(f"D:/{by_old[name]}", x, y) for name, x, y in marks]
+    assert len(place([ControlPoint("P", points[0].world, moved)], loose, capture.offset)[0].seen) == len(
+        first
+    )
 
 
 def test_points_on_a_line_and_too_few_are_refused(setting):
@@ -221,6 +299,12 @@ def test_both_files_of_points_are_read(setting, tmp_path):
     (tmp_path / "gcp_list.txt").write_text(text)
     again, crs = read_control_points(tmp_path / "gcp_list.txt")
     assert crs == "EPSG:32632" and [p.marks for p in again] == [p.marks for p in found]
+    tabs = [
+        "\t".join(map(str, (e, n, h, x, y, f"Flug 1/{image[:3]} 1.JPG"))) for _, e, n, h, image, x, y in rows
+    ]
+    (tmp_path / "gcp_list.txt").write_text("\n".join(["EPSG:32632", *tabs]))
+    again, _ = read_control_points(tmp_path / "gcp_list.txt")
+    assert {mark[0] for p in again for mark in p.marks} == {"Flug 1/DJI 1.JPG"}
 
 
 @pytest.mark.parametrize(

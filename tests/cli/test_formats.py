@@ -30,6 +30,7 @@ from blitzgs.viewer.studio import open_model as open_viewed
 from blitzgs.viewer.web import open_city, web_file
 from blitzgs.viewer.world import Stance, World
 from tests.capture import helpers as files
+from tests.helpers import glb_parts
 from tests.training.tiny import OVERRIDES, as_flags
 
 os.environ.setdefault("NUMBA_DISABLE_JIT", "1")
@@ -142,6 +143,40 @@ def test_files_keep_their_place_in_the_world(whole, tmp_path, capsys):
             assert offset_of(found.comments) == tuple(offset)
         assert main(["export", str(whole), f"--{kind}", str(path)]) == 0
         assert not (tmp_path / f"model.{kind}.offset.json").exists()
+    assert main(["export", str(near), "--tiles", str(tmp_path / "tiles")]) == 0
+    assert "the tiles lie around (500000.0, 4600000.0, 100.0); `blitzgs align" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("kind", "position", "axes"),
+    [
+        ("ply", "coordinates in the file", [1, 1, 1]),
+        ("spz", "(x, -y, -z) of the coordinates in the file", [1, -1, -1]),
+        ("glb", "coordinates in the file, without the turn of its node,", [1, 1, 1]),
+    ],
+)
+def test_the_offset_beside_a_file_is_that_of_what_other_readers_find(whole, tmp_path, kind, position, axes):
+    model, path = read_gaussians(whole), tmp_path / f"model.{kind}"
+    write_ply(
+        tmp_path / "m.ply", **vars(dataclasses.replace(model, comments=["comment offset 500000 4.6e6 9"]))
+    )
+    assert main(["export", str(tmp_path / "m.ply"), f"--{kind}", str(path)]) == 0
+    stated = json.loads(path.with_name(f"model.{kind}.offset.json").read_text())
+    assert stated["meaning"] == f"capture coordinates = {position} + offset"
+    if kind == "glb":
+        content, body = glb_parts(path)
+        accessor = content["accessors"][content["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
+        begin = content["bufferViews"][accessor["bufferView"]].get("byteOffset", 0)
+        raw = np.frombuffer(body, "<f4", 3 * len(model), begin).reshape(-1, 3)
+    elif kind == "spz":
+        read = pytest.importorskip("gaussforge").GaussForge().read(path.read_bytes(), "spz")
+        raw = np.frombuffer(read["data"]["positions"], "<f4").reshape(-1, 3)
+    else:
+        raw = read_gaussians(path).means.numpy()
+    expected = model.means.double().numpy() + [500_000.0, 4_600_000.0, 9.0]
+    np.testing.assert_allclose(
+        (raw * axes + stated["offset"]).mean(axis=0), expected.mean(axis=0), atol=0.001
+    )
 
 
 @pytest.mark.parametrize("name", ["ply", "compressed-ply", "sog"])
@@ -251,11 +286,17 @@ def test_control_points_give_the_world(trained, survey, tmp_path, capsys):
     assert main(["export", str(trained[1]), "--ply", str(tmp_path / "m.ply"), "--coordinates", "world"]) == 0
     offset = json.loads((tmp_path / "m.ply.offset.json").read_text())
     assert offset["crs"] == "EPSG:32632" and offset["meaning"].startswith("world coordinates = ")
+    # Other files that are made of it are in the world, too.
+    assert main(["export", str(tmp_path / "m.ply"), "--spz", str(tmp_path / "m.spz")]) == 0
+    again = json.loads((tmp_path / "m.spz.offset.json").read_text())
+    assert again["crs"] == "EPSG:32632" and again["meaning"].startswith("world coordinates = ")
     up = triple_of(open_source(trained[1]).comments, "up")
     there = triple_of(read_gaussians(tmp_path / "m.ply").comments, "up")
     np.testing.assert_allclose(there, TURN @ up, atol=1e-9)
-    # Into the next zone, where grid north is elsewhere: a turn by the convergence of both.
     pytest.importorskip("pyproj")
+    origin = open_city(trained[1]).transform()[:3, 3]
+    np.testing.assert_allclose(open_city(tmp_path / "m.spz").transform()[:3, 3], origin, atol=1e-3)
+    # Into the next zone, where grid north is elsewhere: a turn by the convergence of both.
     assert main(["align", str(trained[1]), "--crs", "EPSG:32633"]) == 0
     assert "is wrong by at most" in capsys.readouterr().out
     moved = load_world_frame(trained[1])
@@ -268,6 +309,12 @@ def test_a_world_of_exchanged_axes_is_named(trained, survey, tmp_path, capsys):
     path.write_text("\n".join(["name,N,E,h,image,x,y", *survey[1]]))
     with pytest.warns(UserWarning, match="upside down in this world: are E and N exchanged"):
         assert main(["align", str(trained[1]), "--gcp", str(path), "--crs", "EPSG:32632"]) == 0
+
+
+def test_coordinates_around_the_origin_are_hardly_those_of_a_map(trained, survey):
+    (trained[1] / "geo.json").unlink(missing_ok=True)
+    with pytest.warns(UserWarning, match="the cameras lie around E .* of EPSG:32632: .* --gcp or --gps"):
+        assert main(["align", str(trained[1]), "--crs", "EPSG:32632"]) == 0
 
 
 def test_what_cannot_be_aligned_is_refused(trained, survey, tmp_path, failure):

@@ -3,9 +3,11 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import threading
+import warnings
 from pathlib import Path
 
 import cv2
@@ -39,6 +41,19 @@ def test_photographs_in_other_formats_are_named(tmp_path):
     Photographs.of(tmp_path)
     (tmp_path / "view_9.heic").write_bytes(b"")
     warned(r"only its 3 photographs are used; \.heic cannot be read: convert", Photographs.of, tmp_path)
+
+
+def test_photographs_that_are_called_like_maps_are_named(tmp_path):
+    write_photographs(tmp_path, 3)
+    (tmp_path / "masks").mkdir()
+    shutil.copy(tmp_path / "view_0.jpg", tmp_path / "masks" / "view_0.png")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Photographs.of(tmp_path)
+    (tmp_path / "Alpha").mkdir()  # of a camera of Sony's
+    shutil.copy(tmp_path / "view_0.jpg", tmp_path / "Alpha" / "DSC0001.JPG")
+    message = r"1 images are called like maps of depth, alpha .* \(first: Alpha/DSC0001.JPG\)"
+    assert len(warned(message, Photographs.of, tmp_path).names) == 3
 
 
 @pytest.mark.parametrize("suffix", [".webp", ".avif", ".jp2", ".gif"])

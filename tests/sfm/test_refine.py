@@ -72,8 +72,12 @@ def test_a_check_says_how_well_the_lens_fits(scene, taken, advised):
     assert by_chance == pytest.approx(0.12, abs=0.01) and of_lens < 0.03 if not advised else of_lens > 0.1
 
 
-def test_lens_and_poses_are_found(scene, tmp_path, capsys):
+@pytest.mark.parametrize("far", [[0.0, 0.0, 0.0], [512_345.0, 4_612_345.0, 431.0]])
+def test_lens_and_poses_are_found(scene, tmp_path, capsys, far):
     capture, truth = scene(20)
+    model = pycolmap.Reconstruction(capture / "sparse/0")
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array(far)))
+    model.write(capture / "sparse/0")
     assert main(["refine", str(capture), str(tmp_path / "new")]) == 0
     told = capsys.readouterr().out
     assert "\n               -> OPENCV " in told and f"\n  blitzgs train --data {tmp_path / 'new'}" in told

@@ -147,6 +147,14 @@ def test_a_black_or_saturated_picture_is_predicted(data, capsys, value, what):
     assert [text for text in said if f"photographs that were looked at are {what}" in text]
 
 
+def test_twelve_bits_in_files_of_sixteen_are_named(data, capsys):
+    for path in (data / "images").glob("*.png"):
+        pixels = cv2.imread(str(path)).astype(np.uint16)
+        cv2.imwrite(str(path), pixels * 257 // 16)
+    _, _, _, said = check(data, capsys)
+    assert [text for text in said if "are black, and so will" in text and "do 16 bits hold 12 or 10?" in text]
+
+
 def said_of_colours(change="turned", wrong=(), points_like=None, behind=0):
     """Return the warnings; six cameras look straight down on a map, and a pixel is a unit of length."""
     random = np.random.default_rng(0)

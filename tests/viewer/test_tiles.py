@@ -225,6 +225,11 @@ def test_a_georeferenced_run_lies_on_the_globe(trained, tmp_path):
     # An ENU frame of its own: no map projection.
     local = enu_frame(47.3, 8.5, 400.0, "gps")
     np.testing.assert_allclose(to_globe(local, np.zeros(3))[:3, :3], local.rotation, atol=1e-7)
+    # In feet, heights too.
+    place = np.array([6_126_548.0, 2_008_012.0, 400 * 3937 / 1200])
+    feet = to_globe(WorldFrame("EPSG:2227", translation=place, source="geo.json"), np.zeros(3))
+    assert geodetic(feet[:3, 3])[2] == pytest.approx(400, abs=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(feet[:3, :3], axis=0), 1200 / 3937, rtol=2e-4)
     refused(ValueError, "a file: ", to_globe, WorldFrame("EPSG:99999999", source="a file"), np.zeros(3))
 
 

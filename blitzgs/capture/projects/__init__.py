@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from blitzgs.capture.cameras import Float64
+from blitzgs.capture.cameras import Float64, nearest_rotation
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.points import SourcePoints
 from blitzgs.capture.world import WorldFrame
@@ -36,21 +36,25 @@ class ProjectView:
 
 @dataclass(eq=False)
 class Project:
-    """The content of a project; `lost` counts photographs without a pose, `notes` say what has no effect."""
+    """The content of a project; `lost` counts photographs without a pose, `notes` say what has no effect.
+
+    `crs` is the reference system of points that are exported beside it, if that is not the frame's.
+    """
 
     views: list[ProjectView]
     points: SourcePoints | None = None
     frame: WorldFrame | None = None
     lost: int = 0
     notes: list[str] = field(default_factory=list)
+    crs: str = ""
 
 
 def rotation_of(matrix: Float64) -> Float64:
-    """Return a matrix [3, 3]; ValueError: it is no rotation. Views of NaN are dropped later."""
+    """Return the rotation that a matrix [3, 3] is to rounding (else ValueError); NaN stays."""
     is_one = np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-4) and np.linalg.det(matrix) > 0
     if not is_one and not np.isnan(matrix).any():
         raise ValueError(f"no rotation: {np.round(matrix, 6).tolist()}; export the project again")
-    return matrix
+    return nearest_rotation(matrix)
 
 
 def turn(axis: str, degrees: float) -> Float64:

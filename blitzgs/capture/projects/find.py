@@ -5,8 +5,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from blitzgs.capture.cameras import SourceView
 from blitzgs.capture.image_files import read_header
@@ -31,7 +34,7 @@ from blitzgs.capture.projects.realitycapture import (
     read_bundler,
     read_realitycapture,
 )
-from blitzgs.capture.world import converted, frame_beside
+from blitzgs.capture.world import WorldFrame, converted, frame_beside, reference_system
 from blitzgs.util.errors import located, warn
 
 
@@ -181,6 +184,8 @@ def _lenses(
 
 # Points and views that are compared to find out in which coordinates points are.
 _SAMPLE, _VIEWS = 2000, 100
+# Views see points whose pixels are so far apart, as a share of the width.
+_SPREAD = 0.05
 
 
 def _points(root: Path, found: FoundProject, project: Project, views: Sequence[SourceView]) -> SourcePoints:
@@ -195,15 +200,22 @@ def _points(root: Path, found: FoundProject, project: Project, views: Sequence[S
     frame, choices = project.frame, {"the project's own coordinates": points.positions}
     if frame is not None:
         choices[f"coordinates of {frame.name}"] = frame.from_world(points.positions)
-        if points.crs is not None and frame.crs:
-            moved = converted(points.positions, points.crs, frame.crs)
-            choices[f"coordinates of {points.crs.name}"] = frame.from_world(moved)
 
     def seen(name: str) -> int:
         sample = choices[name][:: max(1, len(points.positions) // _SAMPLE)]
-        some = views[:: max(1, len(views) // _VIEWS)]
-        return sum(len(view.pixels_of(sample)) > 0 for view in some)
+        pixels = [(view, view.pixels_of(sample)) for view in views[:: max(1, len(views) // _VIEWS)]]
+        # Points of another world are as one far away, if they are seen at all.
+        return sum(len(p) > 1 and np.ptp(p, axis=0).max() > _SPREAD * view.lens.width for view, p in pixels)
 
+    def add(frame: WorldFrame, crs: Any) -> None:
+        moved = converted(points.positions, crs, frame.crs)
+        choices[f"coordinates of {reference_system(crs).name}"] = frame.from_world(moved)
+
+    if frame is not None and frame.crs and points.crs is not None:
+        add(frame, points.crs)
+    elif frame is not None and frame.crs and project.crs and not any(map(seen, choices)):
+        with suppress(ValueError):  # that no view sees the points is said later
+            add(frame, project.crs)
     best = max(choices, key=seen)
     if best != next(iter(choices)):
         warn(f"{points.path}: the points are in {best}, and are moved to the cameras'")

@@ -19,8 +19,6 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 from xml.parsers import expat
 
-import numpy as np
-
 from blitzgs.capture.cameras import pose_of
 from blitzgs.capture.fields import image_size, number, numbers, read_bytes
 from blitzgs.capture.lens import Lens
@@ -73,9 +71,12 @@ def read_metashape(path: Path) -> Project:
         notes.append(f"{rigs} secondary cameras of a rig have no transform of their own and are left out")
     if any(sensor.find("rolling_shutter") is not None for sensor in sensors.values()):
         notes.append("the rolling shutter is not modelled")
+    reference = (chunk.findtext("reference") or "").strip()
+    local = reference.upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS"))
+    crs = "" if local else reference
     with located("transform"):
-        frame = _frame(chunk, main, path)
-    return Project(views, None, frame, len(others) + found - len(views), notes)
+        frame = _frame(chunk, main, path, GEOCENTRIC if crs else "")
+    return Project(views, None, frame, len(others) + found - len(views), notes, crs)
 
 
 def _read_xml(path: Path) -> Element:
@@ -130,7 +131,7 @@ def _lens(sensor: Element) -> Lens:
     return made_lens("BROWN", size, fx, fy, cx, cy, k1, k2, k3, k4, p2, p1, b2 / fx if fx else 0.0)
 
 
-def _frame(chunk: Element, component: str | None, path: Path) -> WorldFrame | None:
+def _frame(chunk: Element, component: str | None, path: Path, crs: str) -> WorldFrame | None:
     """Return the frame of the component's transform, else the chunk's; None: the chunk has no place."""
     components = list(chunk.iter("component"))
     if component is not None or len(components) > 1:
@@ -142,11 +143,5 @@ def _frame(chunk: Element, component: str | None, path: Path) -> WorldFrame | No
         return None
     values = {"translation": "0 0 0", **_texts(transform)}
     rotation = rotation_of(numbers(values, "rotation", 9).reshape(3, 3))
-    reference = (chunk.findtext("reference") or "").strip()
-    local = not reference or reference.upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS"))
-    # Rounded numbers of the file make the rotation one to about 1e-7 only.
-    u, _, vt = np.linalg.svd(rotation)
     translation = numbers(values, "translation", 3)
-    return WorldFrame(
-        "" if local else GEOCENTRIC, number(values, "scale", 1.0), u @ vt, translation, path.name
-    )
+    return WorldFrame(crs, number(values, "scale", 1.0), rotation, translation, path.name)

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import csv
 import functools
+import re
 from pathlib import Path
 
 import numpy as np
@@ -61,9 +62,9 @@ def read_realitycapture(path: Path) -> Project:
     """Read the cameras of a CSV file."""
     lines = read_text(path).splitlines()
     first = next(i for i, line in enumerate(lines[:2]) if set(_NEEDED) <= set(_columns(line)))
-    columns = _columns(lines[first])
+    columns, separator = _columns(lines[first]), _separator(lines[first])
     views, centres = [], []
-    rows = csv.reader(lines[first + 1 :], delimiter=_separator(lines[first]))
+    rows = csv.reader(lines[first + 1 :], delimiter=separator)
     for place, row in enumerate(rows, start=first + 2):
         if not row or row[0].startswith("#"):
             continue
@@ -71,7 +72,10 @@ def read_realitycapture(path: Path) -> Project:
             if len(row) != len(columns):
                 raise ValueError(f"{len(row)} values in {len(columns)} columns; export it again")
             cells = dict(zip(columns, row, strict=True))
-            values = {key: number(cells, key) for key in columns if key in _NUMBERS}
+            texts = {key: cells[key] for key in columns if key in _NUMBERS}
+            if separator == ";":  # where a comma is the decimal mark
+                texts = {key: text.replace(",", ".") for key, text in texts.items()}
+            values = {key: number(texts, key) for key in texts}
             # Of axes right, up and backwards; ours are right, down and forward.
             rotation = turn("z", -values["heading"]) @ turn("x", values["pitch"]) @ turn("y", values["roll"])
             centre = [values["x"], values["y"], values["alt"]]
@@ -143,9 +147,9 @@ def read_bundler(path: Path) -> Project:
     for index, row in enumerate(rows):
         if row[0] == 0:  # not registered
             continue
-        rotation = row[3:12].reshape(3, 3)
         with located(f"camera {index} ({names[index]})"):
-            pose = pose_of(rotation_of(rotation.T * [1, -1, -1]), -rotation.T @ row[12:15])
+            rotation = rotation_of(row[3:12].reshape(3, 3).T)
+            pose = pose_of(rotation * [1, -1, -1], -rotation @ row[12:15])
         views.append(ProjectView(names[index], functools.partial(_bundle_lens, row[:3]), pose))
     return Project(views, _points(path, lines[5 * cameras :], points), lost=cameras - len(views))
 
@@ -162,10 +166,8 @@ def _names(path: Path, count: int) -> list[str]:
     if found is None:
         raise ValueError("it has no list of its photographs: put list.txt, one name a line, beside it")
     # A line may have a focal length after the name.
-    names = [line.strip() for line in read_text(found).splitlines() if line.strip()]
-    names = [
-        name if len(words := name.rsplit(maxsplit=2)) < 3 or words[1] != "0" else words[0] for name in names
-    ]
+    lines = (line.strip() for line in read_text(found).splitlines())
+    names = [re.sub(r"\s+0\s+[\d.eE+-]+$", "", line) for line in lines if line]
     if len(names) != count:
         raise ValueError(f"{found} has {len(names)} names for its {count} cameras: they must agree")
     return names
