@@ -144,11 +144,11 @@ class _Loader(yaml.SafeLoader):
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         """Compose a node as the parent class does; a reference to a section or a list is an error."""
-        event = self.peek_event()
+        is_reference = self.check_event(yaml.AliasEvent)
         node = super().compose_node(parent, index)
-        if isinstance(event, yaml.AliasEvent) and isinstance(node, yaml.CollectionNode):
-            text = f"*{event.anchor} repeats a section or a list: write it out"
-            raise yaml.MarkedYAMLError(problem=text, problem_mark=event.start_mark)
+        if is_reference and isinstance(node, yaml.CollectionNode):
+            text = "a reference repeats this section or list: write it out"
+            raise yaml.MarkedYAMLError(problem=text, problem_mark=node.start_mark)
         return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
