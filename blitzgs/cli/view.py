@@ -22,7 +22,7 @@ from blitzgs.formats.streamed_sog import META
 from blitzgs.formats.tiles import PAGE, TILESET
 from blitzgs.runs import run_files
 from blitzgs.training.inputs import open_capture
-from blitzgs.util.errors import printable
+from blitzgs.util.errors import WRONG_CONTENT, printable
 from blitzgs.viewer.door import is_loopback, unheard
 
 HELP = """\
@@ -116,7 +116,7 @@ def tiles_server(folder: Path, host: str, port: int) -> ThreadingHTTPServer:
     try:
         tileset = json.loads((folder / TILESET).read_text(encoding="utf-8"))
         complete = tileset["asset"]["generator"] == "BlitzGS" and "view" in tileset["extras"]
-    except (ValueError, LookupError, TypeError, RecursionError) as error:
+    except WRONG_CONTENT as error:
         remedy = "write it again with blitzgs export"
         raise ValueError(f"{folder / TILESET} is damaged ({error}): {remedy}") from error
     if not complete or not (folder / PAGE).is_file():

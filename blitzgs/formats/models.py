@@ -15,7 +15,7 @@ from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased,
 from blitzgs.formats.glb import write_glb
 from blitzgs.formats.ply import PlySource, read_ply, save_ply
 from blitzgs.formats.sog import read_sog, write_sog
-from blitzgs.util.errors import located
+from blitzgs.util.errors import WRONG_CONTENT, located
 from blitzgs.util.output import check_replaceable
 
 _HEADER = 1 << 16
@@ -157,7 +157,7 @@ def stated_offset(path: Path) -> tuple[float, float, float] | None:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         x, y, z = (float(value) for value in content["offset"])
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+    except (OSError, *WRONG_CONTENT):
         return None
     return (x, y, z) if {"file", "meaning"} <= content.keys() else None
 

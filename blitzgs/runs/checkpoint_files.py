@@ -24,13 +24,13 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
-from blitzgs.util.errors import amount
+from blitzgs.util.errors import WRONG_CONTENT, amount
 from blitzgs.util.output import sync_to_disk, write_file
 
 FORMAT = 2
 MANIFEST = "manifest.json"
 # What reading a damaged checkpoint may raise.
-DAMAGE = (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError)
+DAMAGE = (OSError, *WRONG_CONTENT)
 
 
 @dataclass
