@@ -99,6 +99,7 @@ def photographs(folder: Path, data: Path | None) -> Callable[[int], npt.NDArray[
 
 class _Handler(SimpleHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
+    timeout = 60  # seconds without a byte, after which a connection and its thread end
 
     def log_message(self, *args: Any) -> None:
         """Print no line for each file."""
@@ -106,6 +107,11 @@ class _Handler(SimpleHTTPRequestHandler):
     def list_directory(self, path: Any) -> None:
         """Show no listing of a folder."""
         self.send_error(404, "File not found")
+
+
+class _Server(ThreadingHTTPServer):
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Let a browser that has gone, or a name that is none, end its own connection only."""
 
 
 def tiles_server(folder: Path, host: str, port: int) -> ThreadingHTTPServer:
@@ -125,7 +131,7 @@ def tiles_server(folder: Path, host: str, port: int) -> ThreadingHTTPServer:
             "(--spz-tiles), which CesiumJS shows"
         )
     try:
-        return ThreadingHTTPServer((host, port), partial(_Handler, directory=str(folder)))
+        return _Server((host, port), partial(_Handler, directory=str(folder)))
     except (OSError, OverflowError) as error:
         raise unheard(host, port, error) from error
 

@@ -177,7 +177,7 @@ def ask(port, path="/", host="localhost", extra="", method="GET"):
         return connection.makefile().read()
 
 
-def test_the_door_without_a_token_is_for_this_machine(behind):
+def test_the_door_without_a_token_is_for_this_machine(behind, caplog):
     with contextlib.closing(Door("127.0.0.1", 0, behind, "")) as door:
         assert "GET / HTTP/1.1" in ask(door.port, host=f"localhost:{door.port}")
         assert "GET /a?b" in ask(door.port, "/a?b", host="127.0.0.1:1")
@@ -186,6 +186,8 @@ def test_the_door_without_a_token_is_for_this_machine(behind):
         assert " 403 " in ask(door.port, extra=upgrade)
         assert "200 OK" in ask(door.port, extra="Upgrade: websocket\r\nOrigin: http://localhost\r\n")
         assert " 405 " in ask(door.port, method="POST")
+        assert ask(door.port, host="[") == ask(door.port, extra=upgrade.replace("evil", "[")) == ""
+    assert caplog.text == ""  # no error that nobody has caught
 
 
 def test_the_door_with_a_token(behind):
