@@ -23,6 +23,7 @@ from blitzgs.config.ranges import flat as flat
 from blitzgs.config.ranges import problems
 from blitzgs.util.output import write_file
 
+T = typing.TypeVar("T")
 # Marks a removed field whose values have no effect any more.
 IGNORED = object()
 
@@ -90,7 +91,7 @@ def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -
     if path is not None:
         values = _read(Path(path), set())
         try:
-            _build(Config, values, "")
+            build(Config, values)
         except ConfigError as error:
             raise ConfigError(f"{path}: {error}") from error
     for text in overrides:
@@ -112,7 +113,7 @@ def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -
 
 def from_dict(values: dict[str, Any]) -> Config:
     """Rebuild a configuration from `to_dict`'s nested dictionary; raises ConfigError like `load_config`."""
-    return typing.cast(Config, _build(Config, values, ""))
+    return build(Config, values)
 
 
 def to_dict(config: Config) -> dict[str, Any]:
@@ -215,7 +216,8 @@ def _merge(target: dict[str, Any], changes: dict[str, Any], where: str) -> None:
             target[name] = value
 
 
-def _build(kind: type, values: Any, where: str) -> Any:
+def build(kind: type[T], values: Any, where: str = "") -> T:
+    """Return a dataclass of the fields of a section, nested too (ConfigError: names the field in `where`)."""
     hints = typing.get_type_hints(kind)
     if not isinstance(values, dict):
         name = where or "configuration"
@@ -273,7 +275,7 @@ def _hint(name: str, known: list[str]) -> str:
 
 def _convert(hint: Any, value: Any, path: str) -> Any:
     if dataclasses.is_dataclass(hint):
-        return _build(typing.cast(type, hint), value, path)
+        return build(typing.cast(type, hint), value, path)
     origin, options = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Literal:
         if value not in options:
@@ -283,6 +285,8 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
         if value is None or (isinstance(value, bool) and bool in options):
             return value
         return _convert(next(option for option in options if option is not type(None)), value, path)
+    if origin in (dict, list):
+        hint = origin
     if origin is tuple:
         if options[-1] is Ellipsis and isinstance(value, (list, tuple)):
             options = options[:1] * len(value)
@@ -305,7 +309,8 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
     if hint is int and isinstance(value, float) and value.is_integer():
         return int(value)
     if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
-        kinds = {int: "an integer", float: "a number", bool: "true or false", str: "text"}
+        kinds: dict[type, str] = {int: "an integer", float: "a number", bool: "true or false", str: "text"}
+        kinds |= {dict: "a section", list: "a list"}
         raise ConfigError(f"{path}: must be {kinds[hint]}, got {value!r:.80} ({type(value).__name__})")
     return value
 
