@@ -212,6 +212,8 @@ def _bytes_of(model: ColmapModel) -> Iterator[bytes]:
 
 def _joined(heads: list[bytes], offsets: npt.NDArray[np.uint64], rows: npt.NDArray[np.void]) -> bytes:
     """Return the number of records, and for each its head, the number of its rows, and these."""
+    if len(rows) != offsets[-1]:
+        raise ValueError(f"{offsets[-1]} rows of tracks or observations, got {len(rows)}: read them too")
     parts, data, size = [struct.pack("<Q", len(heads))], rows.tobytes(), rows.itemsize
     for head, (begin, end) in zip(heads, pairwise(offsets.tolist()), strict=True):
         parts += [head, struct.pack("<Q", end - begin), data[begin * size : end * size]]

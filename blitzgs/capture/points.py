@@ -32,8 +32,38 @@ def _step(path: Path, count: int) -> int:
     return step
 
 
+def _check_las(path: Path) -> None:
+    """Refuse a LAS or LAZ file that cannot hold what its header counts (ValueError).
+
+    The packages take memory and time for what is counted: a lost byte could end the process. Numbers are at
+    the places of LAS 1.4; the table of chunks is that of LAZ.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+
+        def number(at: int, count: int) -> int:
+            file.seek(at)
+            return int.from_bytes(file.read(count), "little")
+
+        has_more, is_packed = number(25, 1) >= 4, number(104, 1) & 0xC0 != 0
+        begin, row = number(96, 4), number(105, 2)
+        count = number(247, 8) if has_more else number(107, 4)
+        needs = [begin, number(94, 2) + 54 * number(100, 4)]
+        if has_more:
+            needs.append(60 * number(243, 4))
+        if is_packed:
+            table = number(begin, 8)
+            table = number(size - 8, 8) if table == 2**64 - 1 else table
+            needs += [table + 8, row * number(min(table, size) + 4, 4)]  # a chunk begins with a whole point
+        else:
+            needs.append(begin + row * count)
+        if max(needs) > size:
+            raise ValueError(f"its header counts {max(needs):,} bytes, and it has {size:,}")
+
+
 def _read_las(path: Path) -> SourcePoints:
     laspy = optional_package("laspy", "geo", f"{path}: reading it")
+    _check_las(path)
     with laspy.open(path) as reader:
         header = reader.header
         step, begin = _step(path, header.point_count), 0
@@ -145,8 +175,9 @@ def file_points(path: Path) -> SourcePoints:
         except (ImportError, MemoryError):
             raise
         except Exception as error:  # the packages raise all kinds of errors for damaged files
+            reason = str(error).partition("\n")[0]  # the rest is for the package's authors
             raise ValueError(
-                f"{path} cannot be read ({error}): export the points again, or as PLY"
+                f"{path} cannot be read ({reason}): export the points again, or as PLY"
             ) from error
     else:
         cloud = read_point_cloud(path)

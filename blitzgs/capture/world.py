@@ -19,7 +19,7 @@ import numpy as np
 
 from blitzgs.capture.cameras import Float64
 from blitzgs.capture.fields import read_small
-from blitzgs.util.errors import optional_package, warn
+from blitzgs.util.errors import WRONG_CONTENT, optional_package, warn
 
 # The file of a run, and of a capture whose world its own files do not say.
 GEO = "geo.json"
@@ -118,7 +118,7 @@ def read_world_frame(path: Path) -> WorldFrame:
             for name, default in (("rotation", np.eye(3)), ("translation", np.zeros(3)))
         )
         return WorldFrame(crs, float(scale), rotation, translation, str(path.name))
-    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+    except WRONG_CONTENT as error:
         raise ValueError(f"{path} is damaged ({error}): write it again with blitzgs align") from error
 
 

@@ -30,7 +30,7 @@ from blitzgs.runs.evaluation import evaluate, load_lpips, worst_views
 from blitzgs.runs.world import check_seen, config_of_file, subject_of_file
 from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.training.understood import largest_size
-from blitzgs.util.errors import printable
+from blitzgs.util.errors import located, printable
 from blitzgs.util.progress import image_progress
 from blitzgs.view.views import Space, ViewSet
 
@@ -92,7 +92,8 @@ def run(args: argparse.Namespace) -> None:
             check_seen(found, path, capture)
             space = Space.of(capture.offset, capture.extent)
             config = changed(config, "model", near=capture.near / (space.unit * space.extent))
-            subject = subject_of_file(found, config, space, ranks)
+            with located(str(path)):
+                subject = subject_of_file(found, config, space, ranks)
             folder = args.out or path.with_name(f"{path.name}.evaluation") / args.split
         else:
             check_capture(model.space, capture, run_folder)

@@ -22,7 +22,7 @@ from blitzgs.formats.streamed_sog import META
 from blitzgs.formats.tiles import PAGE, TILESET
 from blitzgs.runs import run_files
 from blitzgs.training.inputs import open_capture
-from blitzgs.util.errors import printable
+from blitzgs.util.errors import WRONG_CONTENT, printable
 from blitzgs.viewer.door import is_loopback, unheard
 
 HELP = """\
@@ -99,6 +99,7 @@ def photographs(folder: Path, data: Path | None) -> Callable[[int], npt.NDArray[
 
 class _Handler(SimpleHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
+    timeout = 60  # seconds without a byte, after which a connection and its thread end
 
     def log_message(self, *args: Any) -> None:
         """Print no line for each file."""
@@ -106,6 +107,11 @@ class _Handler(SimpleHTTPRequestHandler):
     def list_directory(self, path: Any) -> None:
         """Show no listing of a folder."""
         self.send_error(404, "File not found")
+
+
+class _Server(ThreadingHTTPServer):
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Let a browser that has gone, or a name that is none, end its own connection only."""
 
 
 def tiles_server(folder: Path, host: str, port: int) -> ThreadingHTTPServer:
@@ -116,7 +122,7 @@ def tiles_server(folder: Path, host: str, port: int) -> ThreadingHTTPServer:
     try:
         tileset = json.loads((folder / TILESET).read_text(encoding="utf-8"))
         complete = tileset["asset"]["generator"] == "BlitzGS" and "view" in tileset["extras"]
-    except (ValueError, LookupError, TypeError, RecursionError) as error:
+    except WRONG_CONTENT as error:
         remedy = "write it again with blitzgs export"
         raise ValueError(f"{folder / TILESET} is damaged ({error}): {remedy}") from error
     if not complete or not (folder / PAGE).is_file():
@@ -125,7 +131,7 @@ def tiles_server(folder: Path, host: str, port: int) -> ThreadingHTTPServer:
             "(--spz-tiles), which CesiumJS shows"
         )
     try:
-        return ThreadingHTTPServer((host, port), partial(_Handler, directory=str(folder)))
+        return _Server((host, port), partial(_Handler, directory=str(folder)))
     except (OSError, OverflowError) as error:
         raise unheard(host, port, error) from error
 

@@ -23,6 +23,7 @@ from blitzgs.config.ranges import flat as flat
 from blitzgs.config.ranges import problems
 from blitzgs.util.output import write_file
 
+T = typing.TypeVar("T")
 # Marks a removed field whose values have no effect any more.
 IGNORED = object()
 
@@ -90,7 +91,7 @@ def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -
     if path is not None:
         values = _read(Path(path), set())
         try:
-            _build(Config, values, "")
+            build(Config, values)
         except ConfigError as error:
             raise ConfigError(f"{path}: {error}") from error
     for text in overrides:
@@ -101,7 +102,7 @@ def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -
             parsed = yaml.load(value, _Loader)
         except _UNREADABLE as error:
             raise ConfigError(f"{name}: cannot read the value '{value}': {error}") from error
-        for part in reversed(name.split(".")):
+        for part in reversed(name.split(".", 2)):
             parsed = {part: parsed}
         _merge(values, parsed, name)
     config = from_dict(values)
@@ -112,7 +113,7 @@ def load_config(path: Path | str | None = None, overrides: Iterable[str] = ()) -
 
 def from_dict(values: dict[str, Any]) -> Config:
     """Rebuild a configuration from `to_dict`'s nested dictionary; raises ConfigError like `load_config`."""
-    return typing.cast(Config, _build(Config, values, ""))
+    return build(Config, values)
 
 
 def to_dict(config: Config) -> dict[str, Any]:
@@ -139,7 +140,17 @@ class _Loader(yaml.SafeLoader):
     """A YAML loader that refuses duplicate keys, of which PyYAML silently keeps the last.
 
     A number whose usual form is another one, and a date, stay text: 100_0001 may be the name of a folder.
+    References to sections and lists are refused: a few lines of them stand for more than memory holds.
     """
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Compose a node as the parent class does; a reference to a section or a list is an error."""
+        is_reference = self.check_event(yaml.AliasEvent)
+        node = super().compose_node(parent, index)
+        if is_reference and isinstance(node, yaml.CollectionNode):
+            text = "a reference repeats this section or list: write it out"
+            raise yaml.MarkedYAMLError(problem=text, problem_mark=node.start_mark)
+        return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Build a mapping as the parent class does; a duplicate key is an error."""
@@ -194,28 +205,23 @@ def _read(path: Path, seen: set[Path]) -> dict[str, Any]:
     return merged
 
 
-_MAX_DEPTH = 20
-
-
-def _merge(target: dict[str, Any], changes: dict[str, Any], where: str, depth: int = 0) -> None:
-    # An anchor can make a section contain itself.
-    if depth > _MAX_DEPTH:
-        raise ConfigError(f"{where}: sections are nested more than {_MAX_DEPTH} deep")
+def _merge(target: dict[str, Any], changes: dict[str, Any], where: str) -> None:
     for name, value in changes.items():
         if isinstance(value, dict):
             section = target.setdefault(name, {})
             if not isinstance(section, dict):
                 raise ConfigError(f"{where}: '{name}' is a value, not a section")
-            _merge(section, value, where, depth + 1)
+            _merge(section, value, where)
         else:
             target[name] = value
 
 
-def _build(kind: type, values: Any, where: str) -> Any:
+def build(kind: type[T], values: Any, where: str = "") -> T:
+    """Return a dataclass of the fields of a section, nested too (ConfigError: names the field in `where`)."""
     hints = typing.get_type_hints(kind)
     if not isinstance(values, dict):
         name = where or "configuration"
-        raise ConfigError(f"{name}: must be a section with {', '.join(hints)}; got {values!r}")
+        raise ConfigError(f"{name}: must be a section with {', '.join(hints)}; got {values!r:.80}")
     if where == "loss":
         values = _in_todays_unit(values)
     arguments = {}
@@ -269,21 +275,23 @@ def _hint(name: str, known: list[str]) -> str:
 
 def _convert(hint: Any, value: Any, path: str) -> Any:
     if dataclasses.is_dataclass(hint):
-        return _build(typing.cast(type, hint), value, path)
+        return build(typing.cast(type, hint), value, path)
     origin, options = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Literal:
         if value not in options:
-            raise ConfigError(f"{path}: must be one of {', '.join(options)}, got {value}")
+            raise ConfigError(f"{path}: must be one of {', '.join(options)}, got {value!s:.80}")
         return value
     if origin in (types.UnionType, typing.Union):
         if value is None or (isinstance(value, bool) and bool in options):
             return value
         return _convert(next(option for option in options if option is not type(None)), value, path)
+    if origin in (dict, list):
+        hint = origin
     if origin is tuple:
         if options[-1] is Ellipsis and isinstance(value, (list, tuple)):
             options = options[:1] * len(value)
         if not isinstance(value, (list, tuple)) or len(value) != len(options):
-            raise ConfigError(f"{path}: must be a list of {len(options)} values, got {value!r}")
+            raise ConfigError(f"{path}: must be a list of {len(options)} values, got {value!r:.80}")
         return tuple(_convert(o, v, f"{path}[{i}]") for i, (o, v) in enumerate(zip(options, value)))  # noqa: B905
     if hint in (int, float) and isinstance(value, str):
         # YAML 1.1 reads 1e-4 as a string. An integer keeps all its digits, which a float may not hold.
@@ -295,14 +303,15 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
         try:
             return float(value)
         except OverflowError:
-            raise ConfigError(f"{path}: {value} is too large") from None
+            raise ConfigError(f"{path}: {value!r:.80} is too large") from None
     if hint is str and isinstance(value, (int, float)) and not isinstance(value, bool):
         return str(value)
     if hint is int and isinstance(value, float) and value.is_integer():
         return int(value)
     if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
-        kinds = {int: "an integer", float: "a number", bool: "true or false", str: "text"}
-        raise ConfigError(f"{path}: must be {kinds[hint]}, got {value!r} ({type(value).__name__})")
+        kinds: dict[type, str] = {int: "an integer", float: "a number", bool: "true or false", str: "text"}
+        kinds |= {dict: "a section", list: "a list"}
+        raise ConfigError(f"{path}: must be {kinds[hint]}, got {value!r:.80} ({type(value).__name__})")
     return value
 
 

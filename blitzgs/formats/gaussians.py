@@ -186,7 +186,8 @@ def triple_of(comments: list[str], name: str) -> tuple[float, float, float] | No
 def up_of(comments: list[str]) -> tuple[float, float, float] | None:
     """Return the upward direction that a header states; None: it states none."""
     up = triple_of(comments, "up")
-    return up if up and any(up) else None
+    # The square of a length beyond these is no number.
+    return up if up and 1e-100 < max(map(abs, up)) < 1e100 else None
 
 
 def _bad_rows(name: str, tensor: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from blitzgs.formats.gaussians import Gaussians, GaussianSource, is_antialiased,
 from blitzgs.formats.glb import write_glb
 from blitzgs.formats.ply import PlySource, read_ply, save_ply
 from blitzgs.formats.sog import read_sog, write_sog
-from blitzgs.util.errors import located
+from blitzgs.util.errors import WRONG_CONTENT, located
 from blitzgs.util.output import check_replaceable
 
 _HEADER = 1 << 16
@@ -178,7 +178,7 @@ def _stated(path: Path) -> dict[str, Any] | None:
         x, y, z = (float(value) for value in content["offset"])
         texts = {name: str(content[name]) for name in ("file", "meaning")}
         return {**texts, "offset": (x, y, z), "crs": str(content.get("crs", ""))}
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+    except (OSError, *WRONG_CONTENT):
         return None
 
 

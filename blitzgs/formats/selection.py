@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from blitzgs.formats.gaussians import Gaussians, GaussianSource
+from blitzgs.util.errors import WRONG_CONTENT
 
 Array = npt.NDArray[np.float64]
 
@@ -164,6 +165,6 @@ def read_polygon(path: Path) -> Array:
         corners = np.array(rows, dtype=np.float64)
         if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3 or not np.isfinite(corners).all():
             raise ValueError("a polygon has at least three corners of two finite numbers")
-    except (ValueError, LookupError, TypeError, RecursionError) as error:
+    except WRONG_CONTENT as error:
         raise ValueError(f"{path} cannot be read as a polygon: {error}") from error
     return corners

@@ -7,6 +7,7 @@ import base64
 import json
 import math
 import re
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -36,6 +37,8 @@ MAX_LISTED = 20_000
 _MAX_WARNINGS, _MAX_TEXT, _MAX_NAME = 200, 2000, 200
 _CURVES = ("loss", "psnr", "gaussians", "images_per_second", "memory_bytes")
 _POPULATION_EVENTS = (None, "densify", "pass_1", "pass_2")
+# An integer of JSON may be larger than any float.
+_LARGEST = sys.float_info.max
 # Keys of the start's record that do not describe the environment.
 _NO_ENVIRONMENT = ("t", "run", "event", "origin", "train", "test")
 
@@ -299,4 +302,4 @@ def _mapping(value: object) -> dict[str, Any]:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= _LARGEST

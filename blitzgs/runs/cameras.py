@@ -208,7 +208,7 @@ def load_cameras(folder: Path) -> RunCameras:
         return RunCameras(cameras, train, test, [Path(text) for text in content["inputs"]])
     except FileNotFoundError:
         raise
-    except (*DAMAGE, OverflowError) as error:
+    except DAMAGE as error:
         raise ValueError(f"{path} is damaged ({error}): give the capture with --data DIR instead") from error
 
 

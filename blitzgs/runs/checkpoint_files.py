@@ -21,16 +21,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from blitzgs.util.errors import amount
+from blitzgs.util.errors import WRONG_CONTENT, amount
 from blitzgs.util.output import sync_to_disk, write_file
 
 FORMAT = 2
 MANIFEST = "manifest.json"
 # What reading a damaged checkpoint may raise.
-DAMAGE = (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError)
+DAMAGE = (OSError, SafetensorError, *WRONG_CONTENT)
 
 
 @dataclass
@@ -63,6 +63,10 @@ def verified(path: Path, part: int = 0, parts: int = 1) -> Manifest:
             raise ValueError(f"{shard.file} has {size} bytes, the manifest says {shard.bytes}")
         if file_digest(file) != shard.sha256:
             raise ValueError(f"{shard.file} does not match its SHA-256")
+        with opened(file) as columns:
+            shapes = [columns.get_slice(name).get_shape() for name in columns.keys()]  # noqa: SIM118
+        if shard is not manifest.shared and any(shape[:1] != [shard.rows] for shape in shapes):
+            raise ValueError(f"{shard.file} has columns of other lengths than the manifest's {shard.rows}")
     return manifest
 
 
@@ -83,6 +87,8 @@ def read_manifest(path: Path) -> Manifest:
     shards = [Shard(**shard) for shard in content["shards"]]
     if not shards:
         raise ValueError(f"{MANIFEST} names no files")
+    if not isinstance(content["state"], dict):
+        raise ValueError(f"{MANIFEST} has no state")
     return Manifest(shards, None if shared is None else Shard(**shared), content["state"])
 
 

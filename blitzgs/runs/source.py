@@ -31,6 +31,7 @@ from blitzgs.runs.run_files import CHECKPOINTS, CONFIG, check_is_run
 from blitzgs.runs.trained_model import Progress, TrainedModel, parsed
 from blitzgs.runs.world import trained_table
 from blitzgs.table.table import PARAMETERS, GaussianTable
+from blitzgs.util.errors import located
 from blitzgs.util.progress import Report
 from blitzgs.view.gate import LodGate
 from blitzgs.view.views import Space, up_direction, viewmat
@@ -112,7 +113,8 @@ class RunSource:
                 last = min(first + gaussians.BLOCK, shard.rows)
                 with opened(self.path / shard.file) as file:
                     rows = {name: file.get_slice(name)[first:last] for name in file.keys()}  # noqa: SIM118
-                table = GaussianTable(rows)
+                with located(str(self.path)):
+                    table = GaussianTable(rows)
                 with torch.no_grad():
                     optimiser.catch_up(table, None, self.progress.step)
                 yield _in_unit(table.columns, self.space, self.has_levels, self.comments)

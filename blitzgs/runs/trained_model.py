@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from typing import Any
 import torch
 
 from blitzgs.config.fields import Config
-from blitzgs.config.files import ConfigError, changed, from_dict, load_config, to_dict
+from blitzgs.config.files import ConfigError, build, changed, from_dict, load_config, to_dict
 from blitzgs.config.schedule import Schedule
 from blitzgs.distributed.group import Ranks
 from blitzgs.optim.table_adam import TableAdam
@@ -30,6 +31,7 @@ from blitzgs.table.blocks import sort_rows
 from blitzgs.table.host_table import HostTable, available_bytes
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
+from blitzgs.util.errors import WRONG_CONTENT
 from blitzgs.view.gate import LodGate, ModelGate
 from blitzgs.view.levels import level_fork
 from blitzgs.view.views import Space, render_options
@@ -180,7 +182,11 @@ def restore(
 
     def load(path: Path) -> checkpoint.Loaded:
         loaded = checkpoint.load(path, ranks, device or ranks.device)
-        found = ranks.all_gather_object(bad_column(GaussianTable(loaded.columns)))
+        try:
+            problem = bad_column(GaussianTable(loaded.columns))
+        except ValueError as error:  # a column is missing, or has another shape or dtype
+            problem = str(error)
+        found = ranks.all_gather_object(problem)
         if wrong := [text for text in found if text]:
             raise CheckpointError(f"checkpoint {path} is refused: {'; '.join(wrong)}")
         return loaded
@@ -218,10 +224,12 @@ def parsed(
         )
     try:
         fields = {field.name for field in dataclasses.fields(Progress)}
-        progress = Progress(**{name: value for name, value in state["progress"].items() if name in fields})
-        space = Space(**(state["space"] | {"offset": tuple(state["space"]["offset"])}))
-        return progress, space, from_dict(state["config"])
-    except (LookupError, TypeError, AttributeError, ConfigError) as error:
+        known_fields = {name: value for name, value in state["progress"].items() if name in fields}
+        space = build(Space, state["space"], "space")
+        if not all(0 < length < math.inf for length in (space.unit, space.extent)):
+            raise ValueError(f"space: unit and extent must be positive, got {space.unit}, {space.extent}")
+        return build(Progress, known_fields, "progress"), space, from_dict(state["config"])
+    except WRONG_CONTENT as error:
         raise CheckpointError(f"checkpoint {path} belongs to another version of BlitzGS: {error}") from error
 
 

@@ -25,6 +25,7 @@ from blitzgs.runs.folder import Model
 from blitzgs.runs.trained_model import MOST_KEPT
 from blitzgs.table.blocks import morton_order
 from blitzgs.table.table import GaussianTable
+from blitzgs.util.errors import located
 from blitzgs.util.output import write_file
 from blitzgs.util.rotations import quaternions
 from blitzgs.view.gate import LodGate, ModelGate
@@ -136,6 +137,7 @@ def gate_of(found: Gaussians, unit: float) -> tuple[LodGate | None, float]:
     """Return the LOD gate in a header of `blitzgs export`, and the share that a view with it keeps at least.
 
     `unit` is a trained unit in the file's. Headers of old files do not state the share, which is then 0.
+    ValueError: the header states a gate that no run has.
     """
     pattern = (
         r"comment lod reference_distance (\S+) fork (\S+) levels (\d+) finest (\d+)"
@@ -145,8 +147,14 @@ def gate_of(found: Gaussians, unit: float) -> tuple[LodGate | None, float]:
     if not matches or found.levels is None:
         return None, 0.0
     distance, fork, count, finest, smooth, least = matches[0].groups()
-    gate = LodGate(float(distance) / unit, float(fork), int(count), int(finest), smooth is not None)
-    return gate, float(least or 0)
+    with located(f"the header line {matches[0][0]!r:.100} is damaged, export the file again"):
+        gate = LodGate(float(distance) / unit, float(fork), int(count), int(finest), smooth is not None)
+        share = float(least or 0)
+        if not (gate.finest < gate.count <= 256 and 0 <= share <= 1):
+            raise ValueError("no run has these levels")
+        if not (0 < gate.reference_distance < math.inf and 1 < gate.fork < math.inf):
+            raise ValueError("no run has these distances")
+    return gate, share
 
 
 def config_of_file(found: GaussianSource) -> Config:

@@ -31,7 +31,7 @@ from blitzgs.distributed.selection import decimal_share, smallest
 from blitzgs.ops.counter_random import uniform
 from blitzgs.ops.population import tree_sums
 from blitzgs.spawn.candidates import FEATURES, Candidates, Veto
-from blitzgs.util.errors import warn
+from blitzgs.util.errors import WRONG_CONTENT, warn
 from blitzgs.util.output import check_replaceable, write_file
 
 FORMAT = 1
@@ -100,7 +100,7 @@ def read_info(path: Path) -> GateInfo:
         if not path.exists():
             raise GateError(f"{path}: no such gate; `blitzgs gate fit` makes one") from None
         raise GateError(f"{beside} is missing: a gate is a model and its metadata, keep both") from None
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+    except WRONG_CONTENT as error:
         raise GateError(f"{beside} is not the metadata of a gate: {error!r}") from error
     if info is None:
         raise GateError(f"{beside}: format {found}, this version reads {FORMAT}")
@@ -130,7 +130,7 @@ class SpawnGate:
             self._trees = _trees_of(json.loads(path.read_text()))
         except OSError as error:
             raise GateError(f"{path} cannot be read: {error.strerror or error}") from error
-        except (ValueError, LookupError, TypeError, OverflowError, RuntimeError) as error:
+        except (*WRONG_CONTENT, RuntimeError) as error:
             raise GateError(f"{path} is not a binary classifier in XGBoost's JSON: {error!r}") from error
 
     def scores(self, features: Tensor) -> Tensor:

@@ -44,7 +44,7 @@ from blitzgs.spawn.candidates import Candidates, Veto
 from blitzgs.spawn.gate import SpawnGate, random_veto, rank_veto, sampled_veto, veto_draws, veto_lowest
 from blitzgs.spawn.lineage import read_lineage
 from blitzgs.training.trainer import Trainer
-from blitzgs.util.errors import warn
+from blitzgs.util.errors import WRONG_CONTENT, warn
 
 REFERENCE = "reference"
 ARMS = (REFERENCE, "oracle", "oracle_rate", "gate", "gate_sampled", "random")
@@ -119,7 +119,7 @@ def branch_point(folder: Path, config: Config) -> Path:
     for manifest in (folder / run_files.CHECKPOINTS).glob(f"checkpoint_*/{MANIFEST}"):
         try:
             step = int(json.loads(manifest.read_text())["state"]["progress"]["step"])
-        except (ValueError, LookupError, TypeError, RecursionError) as error:
+        except WRONG_CONTENT as error:
             raise ValueError(f"{manifest} is damaged: {error!r}") from error
         # Events before the end of a step belong to it.
         if not schedule.has_spawn_gate(step * schedule.batch_size - 1):

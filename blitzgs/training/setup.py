@@ -47,7 +47,7 @@ from blitzgs.training.sampler import BatchSampler, tour_of
 from blitzgs.training.state import Curve, TrainingState
 from blitzgs.training.step import Stepper
 from blitzgs.training.view_level import forget_views
-from blitzgs.util.errors import warn
+from blitzgs.util.errors import located, warn
 from blitzgs.view.levels import Levels, measure_levels
 from blitzgs.view.views import Space, ViewSet, trained_centres
 
@@ -342,7 +342,8 @@ def _of_file(
             f"{path} {how} marked as trained with antialiasing, and this run trains {other} it: "
             f"--model.antialiased={str(marked).lower()} keeps the file's look"
         )
-    gate, _ = gate_of(found, space.unit)
+    with located(str(path)):
+        gate, _ = gate_of(found, space.unit)
     if (
         gate is None
         or (gate.count, gate.fork) != (levels.count, levels.fork)

@@ -23,6 +23,8 @@ class UserError(RuntimeError):
     """An error that a user can cause and correct: commands print its message, without a traceback."""
 
 
+# What the use of JSON with other fields, kinds or sizes of values than expected may raise.
+WRONG_CONTENT = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError)
 # Control characters except tab, and the marks that change the direction of text.
 _CONTROLS = re.compile("[\x00-\x08\x0a-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 

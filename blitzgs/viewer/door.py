@@ -73,8 +73,9 @@ class Door:
 
     async def _visit(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
+            # ValueError: the host or the origin is no address; EOFError: the visitor has gone.
             with contextlib.suppress(
-                OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, asyncio.TimeoutError
+                OSError, ValueError, EOFError, asyncio.LimitOverrunError, asyncio.TimeoutError
             ):
                 head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _HEAD_SECONDS)
                 answer, passed = self._judged(head[:_MAX_HEAD].decode("latin-1"))

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from blitzgs.runs.cameras import RunCamera, checked_camera
-from blitzgs.util.errors import located, optional_package
+from blitzgs.util.errors import WRONG_CONTENT, located, optional_package
 from blitzgs.util.output import check_replaceable, new_file
 from blitzgs.view.draw import intrinsics
 from blitzgs.view.look import MAX_PIXELS
@@ -168,7 +168,7 @@ def _back(file: Path) -> Callable[[Keyframe], Keyframe]:
         matrix, scale = np.array(content["transform"], dtype=np.float64), float(content["scale"])
         if matrix.shape != (3, 4) or not np.isfinite(matrix).all() or not 0 < scale < math.inf:
             raise ValueError(f"transform must be 3 x 4 numbers and scale positive, got {content!r:.200}")
-    except (ValueError, TypeError, LookupError, RecursionError) as error:
+    except WRONG_CONTENT as error:
         reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise ValueError(f"{file}: no dataparser_transforms.json of nerfstudio: {reason}") from error
     rotation, shift = matrix[:, :3], matrix[:, 3]

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from blitzgs.util.errors import WRONG_CONTENT
 from blitzgs.viewer.world import Stance
 
 if TYPE_CHECKING:
@@ -110,17 +111,20 @@ def from_json(text: str) -> CameraPath:
     keys, played = _viewpoints(content, "keyframes"), _viewpoints(content, "camera_path")
     if not (keys or played):
         raise ValueError(f"{_NO_PATH}: it has neither keyframes nor camera_path")
+    fps = _number(content, "fps", 24.0, 0.01, 240.0)
     return CameraPath(
         keys or played,
         round(_number(content, "render_width", 1920, 1)),
         round(_number(content, "render_height", 1080, 1)),
-        _number(content, "fps", 24.0, 0.01),
-        _number(content, "seconds", 4.0, 0.0),
+        fps,
+        _number(content, "seconds", 4.0, 0.0, _MOST_FRAMES / fps),
         bool(content.get("is_cycle", False)),
         played,
     )
 
 
+# Of a film; all are in memory.
+_MOST_FRAMES = 1e6
 _NO_PATH = "this is no camera path in the layout of nerfstudio"
 
 
@@ -144,15 +148,15 @@ def _viewpoints(content: dict[str, Any], name: str) -> list[Keyframe]:
     for index, entry in enumerate(entries):
         try:
             found.append(_keyframe(entry))
-        except (TypeError, AttributeError, ValueError, RecursionError) as error:
+        except WRONG_CONTENT as error:
             raise ValueError(f"{_NO_PATH}: {name}[{index}]: {error}") from error
     return found
 
 
-def _number(fields: dict[str, Any], name: str, default: float, least: float) -> float:
+def _number(fields: dict[str, Any], name: str, default: float, least: float, most: float = 1e9) -> float:
     value = fields.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not least <= value < 1e9:
-        raise ValueError(f"{name} must be a number of at least {least:g}, got {value!r:.40}")
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not least <= value <= most:
+        raise ValueError(f"{name} must be a number from {least:g} to {most:g}, got {value!r:.40}")
     return float(value)
 
 
@@ -177,10 +181,8 @@ def _keyframe(entry: dict[str, Any]) -> Keyframe:
     turn = pose[:3, :3]
     if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0:
         raise ValueError(f"{name} is no rotation with a position")
-    fov = _number(entry, "fov", 50.0, 0.1)
-    if fov >= 179:
-        raise ValueError(f"fov must be below 179 degrees, got {fov:g}")
-    return Keyframe(pose @ _FLIP, fov, _number(entry, "aspect", 16 / 9, 1e-3))
+    fov, aspect = _number(entry, "fov", 50.0, 0.1, 179.0), _number(entry, "aspect", 16 / 9, 1e-3)
+    return Keyframe(pose @ _FLIP, fov, aspect)
 
 
 # Seconds between two keyframes of a recorded movement.

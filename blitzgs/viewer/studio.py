@@ -25,6 +25,7 @@ from blitzgs.runs.folder import open_run, subject_of
 from blitzgs.runs.source import largest_of_run, open_source
 from blitzgs.runs.world import config_of_file, load_world_frame, subject_of_file
 from blitzgs.table.table import PARAMETERS, GaussianTable
+from blitzgs.util.errors import located
 from blitzgs.view.draw import Drawer
 from blitzgs.view.views import Space
 from blitzgs.view.visible import Subject, table_of
@@ -124,7 +125,8 @@ def _open_file(path: Path, ranks: Ranks, paths: Path, most: int | None) -> Opene
     # Centred, so that float32 resolves the positions of a georeferenced model as finely as the file does.
     space = Space.of(middle + np.array(offset_of(found.comments)), max(extent, 1e-6))
     config = changed(config_of_file(found), "model", near=1e-3)
-    subject = subject_of_file(found, config, space, ranks)
+    with located(str(path)):
+        subject = subject_of_file(found, config, space, ranks)
     lod = subject.lod
     exhibit = Exhibit(
         title=path.name,

@@ -18,6 +18,9 @@ constexpr unsigned kHoleBytes = 64 + 8;
 // Limits the memory that a small file can ask for: 8 bytes for each block of all components.
 constexpr uint64_t kMaxBlocks = 1 << 24;
 constexpr unsigned kMaxComponents = 4;
+// Limits the time: a scan of some bytes goes over the whole picture, in this check and in decoders. Encoders
+// write about ten.
+constexpr unsigned kMaxScans = 100;
 
 // More bytes than these after the last block of a scan are image data.
 constexpr size_t kMaxForeignBytes = 4096;
@@ -113,7 +116,7 @@ class Checker {
   }
 
   void read_scan(ImageBytes payload) {
-    ++scans_;
+    if (++scans_ > kMaxScans) fail("damaged JPEG: it has more than " + std::to_string(kMaxScans) + " scans");
     if (components_.empty()) fail("damaged JPEG: image data come before the size");
     if (payload.empty() || payload.size() < 1 + 2u * payload[0])
       fail("damaged JPEG: a scan header is cut off");

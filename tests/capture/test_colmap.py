@@ -157,9 +157,12 @@ def test_the_complete_model_is_read_where_files_of_another_kind_are_left(tmp_pat
 def test_what_the_files_cannot_hold_is_not_written(tmp_path):
     reconstruction(NAMES, 64, 48).write_binary(str(tmp_path))
     model = colmap.read_model(tmp_path)
+    message = "columns of the model have different lengths"
+    without_tracks = rf"{message}: \d+ rows of tracks or observations, got 0"
+    refused(ValueError, without_tracks, colmap.write_model, tmp_path / "out", model)
+    model = colmap.read_model(tmp_path, tracks=True)
     names = model.images.names
     model.images.names = names[:-1]
-    message = "columns of the model have different lengths"
     refused(ValueError, message, colmap.write_model, tmp_path / "out", model)
     model.images.names = names
     model.images.names[1] = "a\nb"

@@ -178,6 +178,18 @@ def test_a_small_jpeg_of_many_blocks_allocates_little(tmp_path, in_fresh_process
     assert in_fresh_process(check_huge, tmp_path / "huge.jpg") == "whole"
 
 
+def test_a_jpeg_of_many_scans_is_refused(tmp_path):
+    """Some bytes a scan cost a decoder the time of the whole picture."""
+    data = cv2.imencode(".jpg", smooth_image(48, 64), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    first = data.index(b"\xff\xda")
+    scan = data[first : data.index(b"\xff\xc4", first)]
+    path = tmp_path / "a.jpg"
+    path.write_bytes(data[:first] + scan * 80 + data[first:])
+    read_whole(path)
+    path.write_bytes(data[:first] + scan * 100 + data[first:])
+    refused(ValueError, "a.jpg: .* JPEG: it has more than 100 scans", read_whole, path)
+
+
 @pytest.mark.parametrize("kind", ["BASELINE", "OPTIMIZE", "PROGRESSIVE", "RST_INTERVAL"])
 def test_a_lost_sector_of_a_jpeg_is_noticed(tmp_path, kind):
     """512 bytes of zeros, as a disk leaves them, wherever they lie in the image data."""

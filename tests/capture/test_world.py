@@ -94,6 +94,7 @@ def test_an_offset_has_the_reference_system_of_its_name(tmp_path):
         ({"rotation": (2 * np.eye(3)).tolist()}, "must be a rotation"),
         ({"rotation": np.diag([1, 1, -1]).tolist()}, "must be a rotation"),
         ({"translation": [0, float("nan"), 0]}, "translation finite"),
+        ({"translation": [10**400, 0, 0]}, "int too large"),
         ({"crs": 32633}, "crs must be text"),
     ],
 )

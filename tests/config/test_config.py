@@ -77,7 +77,11 @@ def test_saved_configuration_reads_back_to_the_same(tmp_path):
         ("--seed", "not an override: write --section.field=value"),
         ("--seed=[", "seed: cannot read the value"),
         ("--schedule.scale=" + "9" * 400, "schedule.scale: 9+ is too large"),
-        ("--log=&all {every: *all}", "log: sections are nested more than 20 deep"),
+        ("--log=&all {every: *all}", "log: cannot read .* a reference repeats this section"),
+        # Eleven lines of nine references each would stand for 31 billion values.
+        ("--seed=[&a [1], [*a, *a]]", "seed: cannot read .* a reference repeats this section"),
+        ("--seed=[" + "1, " * 500 + "]", r"seed: must be an integer, got \[[1, ]{79} \(list\)$"),
+        ("--" + "a." * 5000 + "b=1", "a: unknown field"),
         ("--schedule.iterations=999999999", "times schedule.scale must be at most 10,000,000 images"),
         ("--view.lod=fade", "view.lod: must be true, false or smooth, got fade"),
         ("--lod.visible_threshold=1", r"lod.visible_threshold: must be in \[0, 1\), got 1.0"),

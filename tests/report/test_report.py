@@ -156,6 +156,8 @@ def test_an_unfinished_or_damaged_run_has_a_report(trained, tmp_path):
     data = data_of(report(folder))
     assert "not finished" in data["subtitle"] and data["views"] == [] and data["pictures"] == []
     assert any(str(file) in sentence and "damaged" in sentence for sentence in data["left_out"])
+    file.write_text(f'{{"views": {{"a": {{"psnr": {10**400}, "ssim": 0.5}}}}}}')  # no float is so large
+    assert data_of(report(folder))["views"] == [["a", 0.5]]
 
 
 def test_two_thousand_held_out_views_stay_below_ten_megabytes():

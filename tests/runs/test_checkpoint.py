@@ -71,9 +71,24 @@ def _flip_bit(path, offset):
     path.write_bytes(data)
 
 
+def _seal(path, shard=None, rows=None):
+    """Give a checkpoint other content, with the digests that belong to it."""
+    manifest = checkpoint_files.read_manifest(path)
+    (about,) = manifest.shards
+    file = path / about.file
+    file.write_bytes(shard or file.read_bytes())
+    digest = checkpoint_files.file_digest(file)
+    about.rows, about.bytes, about.sha256 = rows or about.rows, file.stat().st_size, digest
+    path.rename(path.with_name("other"))
+    checkpoint_files.finish(path.with_name("other"), path, manifest)
+
+
 @pytest.mark.parametrize(
     ("damage", "reason"),
     [
+        (lambda p: _seal(p, shard=b"no safetensors" * 9), "deserializing header"),
+        (lambda p: _seal(p, rows=49), "columns of other lengths than the manifest's 49"),
+        (lambda p: _seal(p, rows="many"), "columns of other lengths than the manifest's many"),
         (lambda p: _flip_bit(p / "shard_0000_of_0001.safetensors", 700), "does not match its SHA-256"),
         (lambda p: _flip_bit(p / "shard_0000_of_0001.safetensors", 9), "does not match its SHA-256"),
         (lambda p: os.truncate(p / "shard_0000_of_0001.safetensors", 500), "has 500 bytes"),

@@ -247,6 +247,31 @@ def test_a_checkpoint_of_another_version_is_named(trained, tmp_path, failure, st
     assert "checkpoint_000000 belongs to another version of BlitzGS" in failure("eval", tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("columns", "state", "reason"),
+    [
+        (lambda found: {"means": found["means"].double()}, {}, "column 'means' must be torch.float32"),
+        (lambda found: {"sh": found["sh"].flatten(1)}, {}, "'exp_avg.sh' must be"),
+        (None, {"progress": {"step": "x"}}, "progress.step: must be an integer, got 'x'"),
+        (None, {"progress": {"ledger": [1]}}, "progress.ledger: must be a section, got [1]"),
+        (None, {"space": {"unit": 0}}, "unit and extent must be positive, got 0.0"),
+        (None, {"space": {"offset": [0, 0]}}, "space.offset: must be a list of 3 values"),
+    ],
+)
+@pytest.mark.parametrize("command", [["eval"], ["export", "--ply"]])
+def test_a_sound_checkpoint_of_another_content_is_named(
+    trained, tmp_path, failure, columns, state, reason, command
+):
+    shutil.copy(trained[1] / "config.yaml", tmp_path)
+    loaded = checkpoint.load(next((trained[1] / "checkpoints").iterdir()), Ranks(), "cpu")
+    content = loaded.columns | (columns(loaded.columns) if columns else {})
+    changed = {name: values | state.get(name, {}) for name, values in loaded.state.items() if name != "run"}
+    save_checkpoint(tmp_path / "checkpoints", content, changed, Ranks())
+    command, *flags = command
+    text = failure(command, tmp_path, *flags, *([tmp_path / "m.ply"] if flags else []))
+    assert "checkpoint_000000" in text and reason in text
+
+
 def test_no_flipped_bit_of_a_manifest_passes(tmp_path):
     columns = {"means": torch.randn(5, 3), "id": torch.arange(5)}
     state = {"progress": {"step": 12, "seconds": 1.5}, "config": {"seed": 0, "scale": 1e-3, "ok": True}}

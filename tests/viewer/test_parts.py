@@ -177,7 +177,7 @@ def ask(port, path="/", host="localhost", extra="", method="GET"):
         return connection.makefile().read()
 
 
-def test_the_door_without_a_token_is_for_this_machine(behind):
+def test_the_door_without_a_token_is_for_this_machine(behind, caplog):
     with contextlib.closing(Door("127.0.0.1", 0, behind, "")) as door:
         assert "GET / HTTP/1.1" in ask(door.port, host=f"localhost:{door.port}")
         assert "GET /a?b" in ask(door.port, "/a?b", host="127.0.0.1:1")
@@ -186,6 +186,8 @@ def test_the_door_without_a_token_is_for_this_machine(behind):
         assert " 403 " in ask(door.port, extra=upgrade)
         assert "200 OK" in ask(door.port, extra="Upgrade: websocket\r\nOrigin: http://localhost\r\n")
         assert " 405 " in ask(door.port, method="POST")
+        assert ask(door.port, host="[") == ask(door.port, extra=upgrade.replace("evil", "[")) == ""
+    assert caplog.text == ""  # no error that nobody has caught
 
 
 def test_the_door_with_a_token(behind):
@@ -336,11 +338,16 @@ KEY = {"matrix": opengl(np.eye(4)), "fov": 50, "aspect": 1.5}
         ({"keyframes": [KEY, KEY | {"matrix": [1, 2]}]}, r"keyframes\[1\]: matrix must be 16 finite numbers"),
         ({"keyframes": [KEY | {"matrix": [2.0] * 16}]}, r"keyframes\[0\]: matrix is no rotation"),
         ({"keyframes": [KEY | {"fov": "wide"}]}, r"keyframes\[0\]: fov must be a number"),
-        ({"keyframes": [KEY | {"fov": 200}]}, r"keyframes\[0\]: fov must be below 179"),
+        (
+            {"keyframes": [KEY | {"fov": 200}]},
+            r"keyframes\[0\]: fov must be .* from 0.1 to 179, got 200",
+        ),
         ({"keyframes": [KEY], "camera_path": [KEY, 3]}, r"camera_path\[1\]"),
         ({"camera_path": 3}, "camera_path is no list"),
-        ({"keyframes": [KEY], "fps": -1}, "fps must be a number of at least 0.01, got -1"),
-        ({"keyframes": [KEY], "render_width": 0}, "render_width must be a number of at least 1"),
+        ({"keyframes": [KEY], "fps": -1}, "fps must be a number from 0.01 to 240, got -1"),
+        ({"keyframes": [KEY], "render_width": 0}, "render_width must be a number from 1 to"),
+        ({"keyframes": [KEY], "fps": 100, "seconds": 1e5}, "seconds must be a number from 0 to 10000, got"),
+        ({"keyframes": [KEY | {"matrix": [10**400] * 16}]}, r"keyframes\[0\]: int too large"),
         ({"keyframes": [KEY], "render_width": 1e6}, "render_width and render_height must be at most 8192"),
         ({"keyframes": [KEY], "camera_type": "fisheye"}, "camera_type is 'fisheye'"),
     ],

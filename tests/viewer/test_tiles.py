@@ -3,6 +3,7 @@
 
 import json
 import re
+import socket
 import threading
 
 import numpy as np
@@ -122,6 +123,18 @@ def test_damaged_folders_are_refused(tmp_path):
         OSError, r"cannot listen on 203\.0\.113\.1:0 \(Cannot assign", tiles_server, folder, "203.0.113.1", 0
     )
     refused(OSError, r"\(ports are 0 to 65535\): choose", tiles_server, folder, "127.0.0.1", 99999)
+
+
+def test_requests_that_make_no_sense_are_not_told(tmp_path, capfd):
+    write_tiles(tmp_path / "city", city(100), np.eye(4), SCENE, "x")
+    with tiles_server(tmp_path / "city", "127.0.0.1", 0) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        for path, answer in (("/%00", b""), ("/../../etc/passwd", b"404"), ("/tileset.json", b"200")):
+            with socket.create_connection(("127.0.0.1", server.server_port), timeout=10) as connection:
+                connection.sendall(f"GET {path} HTTP/1.1\r\nConnection: close\r\n\r\n".encode())
+                assert connection.makefile("rb").readline()[9:12] == answer
+        server.shutdown()
+    assert capfd.readouterr() == ("", "")
 
 
 def contents(folder):

@@ -210,6 +210,28 @@ def test_of_a_large_model_the_largest_gaussians_are_read(trained, tmp_path, monk
         assert re.search(rf"a.html: \d+ of {len(whole.table):,} Gaussians", capsys.readouterr().out)
 
 
+@pytest.mark.parametrize(
+    ("stated", "reason"),
+    [
+        ("8.0 fork 2.0 levels 4 finest 99999999999", "no run has these levels"),
+        ("8.0 fork 2.0 levels 999999999 finest 3", "no run has these levels"),
+        ("8.0 fork 2.0 levels 4 finest 3 least nan", "no run has these levels"),
+        ("8.0 fork 1.0 levels 4 finest 3 smooth", "no run has these distances"),
+        ("nan fork 2.0 levels 4 finest 3", "no run has these distances"),
+        ("far fork 2.0 levels 4 finest 3", "could not convert"),
+    ],
+)
+def test_a_header_with_impossible_levels_is_refused(tmp_path, stated, reason):
+    line = f"comment lod reference_distance {stated}"
+    message = f"m.ply: the header line '{line[:80]}.*export the file again: .*{reason}"
+    refused(ValueError, message, write_model, tmp_path / "m.ply", (line,), 0, 20)
+
+
+@pytest.mark.parametrize("up", ["comment up 1e200 0 0", "comment up 0 1e-200 0", "comment up 0 0 0"])
+def test_an_upward_direction_without_a_length_is_none(tmp_path, up):
+    assert write_model(tmp_path / "m.ply", (up,), 0, 20).exhibit.up is None
+
+
 def test_wrong_flags_are_named(trained, tmp_path, failure):
     page, ply = ["--html", str(tmp_path / "a.html")], ["--ply", str(tmp_path / "a.ply")]
     for flags, reason in (

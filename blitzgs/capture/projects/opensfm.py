@@ -27,7 +27,7 @@ from blitzgs.capture.lens import Lens
 from blitzgs.capture.points import SourcePoints
 from blitzgs.capture.projects import Project, ProjectView, made_lens
 from blitzgs.capture.world import WorldFrame, enu_frame, utm_of_text
-from blitzgs.util.errors import located
+from blitzgs.util.errors import WRONG_CONTENT, located
 
 NAME, ORIGINAL = "reconstruction.json", "reconstruction.topocentric.json"
 _MODELS = {
@@ -86,12 +86,12 @@ def _lens(camera: Any) -> Lens:
 
 
 def _points(part: Mapping[str, Any], path: Path) -> SourcePoints:
-    points = [p for p in (part.get("points") or {}).values() if isinstance(p, Mapping)]
     try:
+        points = [p for p in (part.get("points") or {}).values() if isinstance(p, Mapping)]
         positions = np.array([p["coordinates"] for p in points], dtype=np.float64).reshape(len(points), 3)
         colors = np.array([p.get("color", (128, 128, 128)) for p in points], dtype=np.float64)
         colors = np.clip(np.nan_to_num(colors.reshape(len(points), 3)), 0, 255)
-    except (KeyError, TypeError, ValueError) as error:
+    except WRONG_CONTENT as error:
         raise ValueError(f"points: expected three coordinates and colours each ({error})") from error
     return SourcePoints(positions, colors.astype(np.uint8), path=path, colors_from="the points' own colours")
 

@@ -35,7 +35,7 @@ from blitzgs.capture.fields import number, read_bytes, read_text
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.points import SourcePoints
 from blitzgs.capture.projects import Project, ProjectView, made_lens, rotation_of, turn
-from blitzgs.util.errors import located
+from blitzgs.util.errors import WRONG_CONTENT, located
 
 _NEEDED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 # Newer versions write these names.
@@ -178,7 +178,7 @@ def _points(path: Path, lines: list[bytes], count: int) -> SourcePoints:
         positions = np.array(b" ".join(lines[: 3 * count : 3]).split(), dtype=np.float64).reshape(count, 3)
         colors = np.array(b" ".join(lines[1 : 3 * count : 3]).split(), dtype=np.float64).reshape(count, 3)
         tracks = np.array([int(line.split(None, 1)[0]) for line in lines[2 : 3 * count : 3]], dtype=np.int64)
-    except (ValueError, IndexError) as error:
+    except WRONG_CONTENT as error:
         raise ValueError(f"a point has not three lines of numbers ({error}); export it again") from error
     return SourcePoints(
         positions,
