@@ -6,6 +6,8 @@ The functions about pixels have gsplat's names and results.
 
 from __future__ import annotations
 
+from numbers import Integral
+
 import torch
 from torch import Tensor
 
@@ -164,6 +166,10 @@ def rasterize_contributing_gaussian_ids(
         shape, then 0; [M, K] with `pixels`. Packed, ids number the entries of `meta`, whose Gaussians
         `meta["gaussian_ids"]` has; otherwise the N Gaussians.
     """
+    if not isinstance(num_contributing_gaussians, Tensor):
+        raise TypeError(
+            "num_contributing_gaussians must be what rasterize_num_contributing_gaussians returned"
+        )
     most = int(num_contributing_gaussians.max()) if num_contributing_gaussians.numel() else 0
     return rasterize_top_contributing_gaussian_ids(
         means2d, conics, opacities, tile_offsets, flatten_ids, image_width, image_height, tile_size, most,
@@ -218,6 +224,10 @@ def _splats_of_pixels(
     for name, integers in (("tile_offsets", tile_offsets), ("flatten_ids", flatten_ids)):
         if not isinstance(integers, Tensor) or integers.is_floating_point():
             raise TypeError(f"{name} must be a tensor of integers, as meta has it")
+    whole = {"image_width": (width, 1), "image_height": (height, 1), "tile_size": (tile_size, 1)}
+    for name, (value, least) in {**whole, "num_depth_samples": (strongest, 0)}.items():
+        if not isinstance(value, Integral) or value < least:
+            raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
     shape, tiles = tuple(means2d.shape[:-1]), tile_counts(width, height, tile_size)[::-1]
     for name, tensor, wanted in (
         ("means2d", means2d, (*shape, 2)),

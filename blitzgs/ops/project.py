@@ -167,7 +167,7 @@ def project(
         Ks: [B, 3, 3] pinhole intrinsics in px; a view with a skew, or another last row than 0, 0, 1, sees
             nothing.
         width, height, near_plane, far_plane, eps2d, radius_clip: as in `blitzgs.rasterization`.
-        active_ids: int32 [A], the rows to consider, ascending; None: all rows.
+        active_ids: int32 [A], the rows to consider, ascending, each once (the CPU checks it); None: all rows.
         active_views: int32 [A], the views to consider for each of these rows, as bits; None: all views.
         tile_size: edge of a tile in px (only for `tiles_touched`).
         sh_degree: degree to evaluate, 0 to 3.
@@ -190,6 +190,11 @@ def project(
     check_tensors(means=means, quats=quats, scales=scales, opacities=opacities, viewmats=viewmats, Ks=Ks)
     if active_views is not None and active_ids is None:
         active_ids = torch.arange(len(means), dtype=torch.int32, device=means.device)
+    elif active_ids is not None and active_ids.is_cpu and not torch.compiler.is_compiling():
+        edges = active_ids.new_tensor([-1]), active_ids.flatten(), active_ids.new_tensor([len(means)])
+        if (torch.cat(edges).diff() <= 0).any():
+            most = len(means) - 1
+            raise RuntimeError(f"project: active_ids must be rows 0 to {most}, ascending, each once")
     options = ProjectionOptions(
         width, height, tile_size, sh_degree, near_plane, far_plane, eps2d, radius_clip, antialiased, raw
     )

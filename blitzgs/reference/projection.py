@@ -137,7 +137,7 @@ def _visible(parameters: list[Tensor], viewmat: Tensor, near: float, far: float)
     depths = parameters[0] @ viewmat[2, :3] + viewmat[2, 3]
     keep = (depths > near) & (depths <= far)
     for parameter in parameters:
-        keep &= parameter.reshape(len(depths), -1).isfinite().all(dim=1)
+        keep &= parameter[:, None].flatten(1).isfinite().all(dim=1)
     ids = keep.nonzero()[:, 0]
     return ids[depths[ids].argsort(stable=True)]
 

@@ -169,6 +169,8 @@ def test_batches_and_lists_of_pixels():
         ({0: torch.zeros(3, 3)}, ValueError, "means2d must be"),
         ({3: torch.zeros(2, 1, 2, dtype=torch.int64)}, ValueError, r"tile_offsets must be \[2, 2, 3\]"),
         ({4: torch.zeros(3)}, TypeError, "flatten_ids must be a tensor of integers"),
+        ({5: 40.0}, ValueError, "image_width must be a whole number of at least 1, got 40.0"),
+        ({7: 0}, ValueError, "tile_size must be a whole number of at least 1, got 0"),
     ],
 )
 def test_wrong_arguments_are_named(change, error, message):
@@ -177,6 +179,14 @@ def test_wrong_arguments_are_named(change, error, message):
     for at, value in change.items():
         given[at] = value
     refused(error, message, blitzgs.rasterize_num_contributing_gaussians, *given)
+
+
+def test_wrong_numbers_of_contributors_are_named():
+    given = arguments(rasterize_scene(random_scene(n=5))[2])
+    message = "num_depth_samples must be a whole number of at least 0, got -1"
+    refused(ValueError, message, blitzgs.rasterize_top_contributing_gaussian_ids, *given, -1)
+    message = "num_contributing_gaussians must be what"
+    refused(TypeError, message, blitzgs.rasterize_contributing_gaussian_ids, *given, 3)
 
 
 def test_entries_of_two_calls_are_refused():

@@ -283,6 +283,9 @@ def test_errors_name_the_argument():
         refused(RuntimeError, "eps2d must .* radius_clip at least 0", project_scene, scene, **wrong)
     refused(RuntimeError, "at most 32 views in .*, got 33", project_scene, random_scene(n=1, cameras=33))
     refused(RuntimeError, "active_ids must .* got Long", project_scene, scene, active_ids=torch.arange(2))
+    for ids in ([-1, 3], [1, 1, 3], [1, 4], [2, 1]):
+        wrong = torch.tensor(ids, dtype=torch.int32)
+        refused(RuntimeError, "active_ids must be rows 0 to 3, asc", project_scene, scene, active_ids=wrong)
     refused(TypeError, "Ks must be a torch.Tensor, got NoneType", project_scene, replace(scene, Ks=None))
 
 

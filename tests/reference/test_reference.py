@@ -118,6 +118,12 @@ def test_what_does_not_fit_is_named(name, value, message):
     refused(ValueError, message, render, width=8, height=8, **given)
 
 
+def test_no_gaussians_leave_the_background():
+    (image,) = reference_images(random_scene(n=0, cameras=1), torch.full((1, 3), 0.3), render_mode="RGB+ED")
+    assert not (image.alpha.any() or image.cut.any() or image.image[..., 3].any())
+    assert torch.equal(image.image[..., :3], torch.full((32, 40, 3), 0.3).double())
+
+
 def test_non_finite_gaussians_spread_nowhere_not_even_into_gradients():
     scene = random_scene(n=20, cameras=1)
     clean = reference_images(scene)[0]
