@@ -98,8 +98,6 @@ def _run(given: list[str]) -> int:
         print(f"{name}: interrupted", file=sys.stderr)
         return 130
     except Exception as error:
-        from rich.console import Console
-
         _tell_other_ranks(f"{type(error).__name__}: {_message(error)}")
         # Any other error is a fault of the program and keeps its traceback.
         if not isinstance(error, (ValueError, OSError, ImportError, MemoryError, UserError)):
@@ -107,7 +105,12 @@ def _run(given: list[str]) -> int:
         # Those of Python's imports and of YAML have lines.
         lines = isinstance(error, ImportError) or type(error).__name__ == "ConfigError"
         text = f"{name}: {printable(_message(error), lines)}"
-        Console(stderr=True).out(text, style="red", highlight=False)
+        try:
+            from rich.console import Console
+
+            Console(stderr=True).out(text, style="red", highlight=False)
+        except ImportError:
+            print(text, file=sys.stderr)
         return 1
 
 
@@ -131,6 +134,8 @@ def _arguments(parser: Parser, chosen: str, given: list[str]) -> argparse.Namesp
         unknown = [text for text in unknown if text not in fields]
     if unknown:
         meant = flag_meant(parser_of, unknown[0])
+        if chosen == "train" and not args.data and not unknown[0].startswith("-"):
+            meant = f"--data {unknown[0]}"
         hint = f"; did you mean {meant}?" if meant else ""
         if chosen == "train" and not meant:
             hint = " (configuration fields are written --section.field=value)"
@@ -184,6 +189,8 @@ def _message(error: BaseException) -> str:
     """Return the error's text; for an error of the operating system, the file and the reason."""
     if isinstance(error, MemoryError) and not str(error):
         return "the memory is not sufficient: use smaller images (--data.downscale) or a larger machine"
+    if isinstance(error, ModuleNotFoundError):  # of those that every installation has
+        return f"{sys.executable} has no {error.name}: use the Python of the environment that has BlitzGS"
     if not isinstance(error, OSError) or error.filename is None or error.strerror is None:
         return str(error)
     if isinstance(error, (FileExistsError, NotADirectoryError)):

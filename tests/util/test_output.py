@@ -112,7 +112,8 @@ def test_only_regular_files_are_replaced(tmp_path, kind):
     elif kind == "pipe":
         os.mkfifo(path)
     before = path.lstat()
-    refused(OSError, "which is not overwritten", write_file, path, b"new")
+    remedy = "name a file in it" if kind == "folder" else "remove it or choose another name"
+    refused(OSError, f"which is not overwritten: {remedy}", write_file, path, b"new")
     assert path.lstat().st_ino == before.st_ino and path.lstat().st_mode == before.st_mode
 
 
