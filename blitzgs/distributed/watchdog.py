@@ -330,8 +330,8 @@ class Watchdog:
                 self.stopping.set()
                 if self.calls > 0:
                     print(
-                        f"rank {self.rank}: the job's store cannot be reached (was torchrun killed?): process "
-                        f"{os.getpid()} works on without it, and SIGTERM stops it",
+                        f"rank {self.rank}: the job's store cannot be reached (was torchrun killed?): "
+                        f"process {os.getpid()} works on without it, and SIGTERM stops it",
                         file=sys.stderr,
                         flush=True,
                     )
