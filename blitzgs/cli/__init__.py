@@ -56,6 +56,8 @@ COMMANDS = {
     "completion": ("blitzgs.cli.completion", "print a script that completes commands in a shell"),
     "synth": ("blitzgs_synth.generate", "make a synthetic city: photographs, cameras and points to train on"),
 }
+# Commands whose work the processes of torchrun share.
+SHARED = ("train", "eval", "render", "gate")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -93,6 +95,8 @@ def _run(given: list[str]) -> int:
             parser.print_help(sys.stderr)
             return 2
         args = _arguments(parser, chosen, given)
+        if "TORCHELASTIC_RUN_ID" in os.environ and _processes() > 1 and chosen not in SHARED:
+            raise ValueError("this is the work of one process: run it without torchrun")
         return cast(Callable[[argparse.Namespace], int | None], args.run)(args) or 0
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
@@ -114,9 +118,14 @@ def _run(given: list[str]) -> int:
         return 1
 
 
+def _processes() -> int:
+    """Return how many processes torchrun has started for this command."""
+    return int(os.environ.get("WORLD_SIZE", "1"))
+
+
 def _tell_other_ranks(message: str) -> None:
     """Publish why this process fails, if others of a job may wait for it to join them."""
-    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+    if _processes() > 1:
         with suppress(Exception):  # the job's store may have ended, and torch may be what failed
             from blitzgs.distributed.watchdog import report_early_failure
 

@@ -156,6 +156,15 @@ def test_mistakes_get_a_message(command, status, message, capsys, tmp_path, monk
     assert message in printed and "Traceback" not in printed and "usage:" not in printed
 
 
+@pytest.mark.parametrize("command", ["view x", "export x --ply m.ply", "sfm x y", "synth x"])
+def test_commands_of_one_process_refuse_torchrun(command, monkeypatch, tmp_path, failure):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
+    monkeypatch.chdir(tmp_path)
+    assert "this is the work of one process: run it without torchrun" in failure(*command.split())
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_python_without_our_packages_is_named(tmp_path):
     without = "import sys; sys.modules |= {'numpy': None, 'rich': None}; from blitzgs.cli import main"
     code = f"{without}; sys.exit(main(['train', '--data', 'd', '--out', 'x']))"
