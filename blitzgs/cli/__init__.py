@@ -56,6 +56,8 @@ COMMANDS = {
     "completion": ("blitzgs.cli.completion", "print a script that completes commands in a shell"),
     "synth": ("blitzgs_synth.generate", "make a synthetic city: photographs, cameras and points to train on"),
 }
+# Commands whose work the processes of torchrun share.
+SHARED = ("train", "eval", "render", "gate")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -93,13 +95,13 @@ def _run(given: list[str]) -> int:
             parser.print_help(sys.stderr)
             return 2
         args = _arguments(parser, chosen, given)
+        if "TORCHELASTIC_RUN_ID" in os.environ and _processes() > 1 and chosen not in SHARED:
+            raise ValueError("this is the work of one process: run it without torchrun")
         return cast(Callable[[argparse.Namespace], int | None], args.run)(args) or 0
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         return 130
     except Exception as error:
-        from rich.console import Console
-
         _tell_other_ranks(f"{type(error).__name__}: {_message(error)}")
         # Any other error is a fault of the program and keeps its traceback.
         if not isinstance(error, (ValueError, OSError, ImportError, MemoryError, UserError)):
@@ -107,13 +109,23 @@ def _run(given: list[str]) -> int:
         # Those of Python's imports and of YAML have lines.
         lines = isinstance(error, ImportError) or type(error).__name__ == "ConfigError"
         text = f"{name}: {printable(_message(error), lines)}"
-        Console(stderr=True).out(text, style="red", highlight=False)
+        try:
+            from rich.console import Console
+
+            Console(stderr=True).out(text, style="red", highlight=False)
+        except ImportError:
+            print(text, file=sys.stderr)
         return 1
+
+
+def _processes() -> int:
+    """Return how many processes torchrun has started for this command."""
+    return int(os.environ.get("WORLD_SIZE", "1"))
 
 
 def _tell_other_ranks(message: str) -> None:
     """Publish why this process fails, if others of a job may wait for it to join them."""
-    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+    if _processes() > 1:
         with suppress(Exception):  # the job's store may have ended, and torch may be what failed
             from blitzgs.distributed.watchdog import report_early_failure
 
@@ -131,6 +143,8 @@ def _arguments(parser: Parser, chosen: str, given: list[str]) -> argparse.Namesp
         unknown = [text for text in unknown if text not in fields]
     if unknown:
         meant = flag_meant(parser_of, unknown[0])
+        if chosen == "train" and not args.data and not unknown[0].startswith("-"):
+            meant = f"--data {unknown[0]}"
         hint = f"; did you mean {meant}?" if meant else ""
         if chosen == "train" and not meant:
             hint = " (configuration fields are written --section.field=value)"
@@ -184,6 +198,8 @@ def _message(error: BaseException) -> str:
     """Return the error's text; for an error of the operating system, the file and the reason."""
     if isinstance(error, MemoryError) and not str(error):
         return "the memory is not sufficient: use smaller images (--data.downscale) or a larger machine"
+    if isinstance(error, ModuleNotFoundError):  # of those that every installation has
+        return f"{sys.executable} has no {error.name}: use the Python of the environment that has BlitzGS"
     if not isinstance(error, OSError) or error.filename is None or error.strerror is None:
         return str(error)
     if isinstance(error, (FileExistsError, NotADirectoryError)):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import os
 import re
 import shutil
 import textwrap
@@ -99,10 +100,13 @@ def number(
 
 
 def named_path(text: str) -> Path:
-    """Return a path; refuse an empty one, because `--out "$UNSET"` would mean the current folder."""
+    """Return a path; refuse an empty one, because `--out "$UNSET"` would mean the current folder.
+
+    Shells leave the ~ of `--out=~/runs` as it is, which would make a folder of that name.
+    """
     if not text:
         raise argparse.ArgumentTypeError("the path is empty")
-    return Path(text)
+    return Path(os.path.expanduser(text))
 
 
 _ARGUMENT = re.compile(r"([\w-]+)(?: (\S+))?  (.*)", re.DOTALL)

@@ -27,6 +27,7 @@ from typing import Any
 from blitzgs import __version__
 from blitzgs.cli.arguments import Commands, add_command
 from blitzgs.cli.doctor_probes import REINSTALL, REPORT, found
+from blitzgs.util.memory import available_bytes, host_bytes
 
 HELP = """\
 Check this installation: torch, the GPUs, the libraries, optional packages, and small renderings that are
@@ -171,8 +172,7 @@ def _system() -> Line:
 
 
 def _memory() -> Line:
-    found = dict(re.findall(r"^(\w+): +(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE))
-    total, free = (1024 * int(found[name]) for name in ("MemTotal", "MemAvailable"))
+    total, free = host_bytes(), available_bytes()
     text = f"{free / 1e9:.1f} of {total / 1e9:.1f} GB free"
     little = free < _LITTLE_MEMORY
     remedy = "end other programs, or train with --data.downscale=2" if little else ""

@@ -134,8 +134,6 @@ def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Export a model."""
-    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        raise ValueError("export writes one file from one process: run it without torchrun")
     if args.clean is None:
         _refuse(args, ("data",), "is for --clean, which compares with the photographs")
     with ending_by_exception():

@@ -108,7 +108,12 @@ ARGUMENTS = f"""{DEVICES}
 
 def add_to(commands: Commands[argparse.ArgumentParser], summary: str) -> None:
     """Add the command."""
-    types: Types = {"--extend": _EXTENSION, "--minutes": float, "--viewer": int}
+    types: Types = {
+        "--config": os.path.expanduser,
+        "--extend": _EXTENSION,
+        "--minutes": float,
+        "--viewer": int,
+    }
     parser = add_command(commands, "train", run, summary, HELP, ARGUMENTS, types, add_help=False)
     parser.set_defaults(device="auto", viewer_host="127.0.0.1")
     parser.add_argument(

@@ -293,8 +293,10 @@ class Watchdog:
             self.store.set(f"progress/{self.rank}", content)
 
     def _try_to_publish(self) -> None:
-        with suppress(RuntimeError):  # the store's host ended first; the next collective says so
-            self._publish()
+        # Where the store's host ended first, the next collective says so.
+        with suppress(RuntimeError):
+            if not self.stopping.is_set():  # else torch would print a trace of C++ each time
+                self._publish()
 
     def _run(self) -> None:
         last = time.monotonic()
@@ -324,7 +326,15 @@ class Watchdog:
                 if waited > min(limit, PATIENCE_SECONDS) and (late := self._late_ranks()):
                     self.announce(late, waited)
             except RuntimeError:
-                return  # the store's host has ended; the collectives report that themselves
+                # Collectives need no store: they go on, and report themselves what fails.
+                self.stopping.set()
+                if self.calls > 0:
+                    print(
+                        f"rank {self.rank}: the job's store cannot be reached (was torchrun killed?): "
+                        f"process {os.getpid()} works on without it, and SIGTERM stops it",
+                        file=sys.stderr,
+                        flush=True,
+                    )
 
     def announce(self, late: str, waited: float) -> None:
         """Print about once a minute which ranks this one waits for."""

@@ -12,11 +12,11 @@ from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
-import psutil
 import torch
 from torch import Tensor
 
 from blitzgs.util.errors import amount, check_tensors
+from blitzgs.util.memory import available_bytes
 
 # Writers take so many Gaussians at a time: 62 MB at SH degree 3.
 BLOCK = 1 << 18
@@ -141,7 +141,7 @@ def check_memory(holds: str, count: int, degree: int, copies: int = 2) -> None:
     names both amounts.
     """
     needed = copies * 4 * count * (11 + 3 * (degree + 1) ** 2)
-    free = psutil.virtual_memory().available
+    free = available_bytes()
     if needed > free:
         raise ValueError(
             f"{holds} {count:,} Gaussians: reading them takes {amount(needed)} of memory or more, and "

@@ -20,9 +20,9 @@ from blitzgs.ops.counter_random import hash_keys, normal
 from blitzgs.optim.table_adam import Pending
 from blitzgs.spawn.candidates import Candidates, Veto, spawn_features
 from blitzgs.spawn.lineage import Births, Cause, Lineage
-from blitzgs.table.host_table import available_bytes
 from blitzgs.table.placement import place
 from blitzgs.table.table import PARAMETERS, GaussianTable, opacity_logit
+from blitzgs.util.memory import available_bytes
 from blitzgs.util.rotations import quaternion_matrices
 
 SPLIT_SHRINK = 1.6

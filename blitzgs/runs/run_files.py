@@ -29,5 +29,7 @@ def run_and_checkpoint(path: Path) -> tuple[Path, str | None]:
 def check_is_run(folder: Path) -> None:
     """Refuse a folder that has neither a configuration nor checkpoints (FileNotFoundError)."""
     if not (folder / CONFIG).exists() and not (folder / CHECKPOINTS).exists():
-        lacks = f"it has no {CONFIG} and no {CHECKPOINTS}" if folder.exists() else "there is no such path"
-        raise FileNotFoundError(f"{folder} is not a run: {lacks}")
+        lacks = f"it has no {CONFIG} and no {CHECKPOINTS}: name the --out of a `blitzgs train`"
+        raise FileNotFoundError(
+            f"{folder} is not a run: {lacks if folder.exists() else 'there is no such path'}"
+        )

@@ -28,10 +28,11 @@ from blitzgs.runs.log import records
 from blitzgs.runs.resume import compare_with_file
 from blitzgs.runs.run_files import CAMERAS, CHECKPOINTS, CONFIG, LOG, check_is_run
 from blitzgs.table.blocks import sort_rows
-from blitzgs.table.host_table import HostTable, available_bytes
+from blitzgs.table.host_table import HostTable
 from blitzgs.table.pool import Pool
 from blitzgs.table.table import GaussianTable
 from blitzgs.util.errors import WRONG_CONTENT
+from blitzgs.util.memory import available_bytes
 from blitzgs.view.gate import LodGate, ModelGate
 from blitzgs.view.levels import level_fork
 from blitzgs.view.views import Space, render_options

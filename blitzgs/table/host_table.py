@@ -8,13 +8,13 @@ import math
 import mmap
 import weakref
 
-import psutil
 import torch
 from torch import Tensor
 
 from blitzgs.ops.blocks import take_rows
 from blitzgs.table.table import GROWTH, GaussianTable
 from blitzgs.util.errors import UserError, amount
+from blitzgs.util.memory import available_bytes
 
 
 class HostMemoryError(UserError):
@@ -83,11 +83,6 @@ def fits(memory: Tensor | None, like: Tensor, rows: int) -> bool:
     if memory is None or memory.dtype != like.dtype:
         return False
     return memory.shape[1:] == like.shape[1:] and len(memory) >= rows
-
-
-def available_bytes() -> int:
-    """Return how many bytes the host can allocate without swapping."""
-    return int(psutil.virtual_memory().available)
 
 
 def _unpin(address: int, _pages: mmap.mmap) -> None:

@@ -24,6 +24,7 @@ from blitzgs.capture.shared_images import SharedImages, size_of
 from blitzgs.config.fields import BLACK, Config, DataConfig
 from blitzgs.config.files import ConfigError, flat, to_dict
 from blitzgs.distributed.group import Ranks
+from blitzgs.util.memory import host_bytes
 from blitzgs.view.views import Space
 
 # Fields that may differ between the hosts of a job.
@@ -32,8 +33,6 @@ HOST_FIELDS = ("data.path", "data.cache_bytes")
 LEAST_SIDE = 11
 # Photographs whose alpha and mean colour are looked at before training, and pixels from one to the next.
 _LOOKED_AT, _STRIDE = 8, 4
-# The largest memory of a container in bytes, or "max" (Linux, control groups 2).
-_CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
 
 def read_ahead(data: DataConfig) -> Future[Capture] | None:
@@ -68,7 +67,7 @@ def open_capture(
         capture = reading.result() if reading else load_configured(data, partial(_damaged_of_share, ranks))
     except MissingImagesError as error:
         raise MissingImagesError(f"{error} ({remedy})") from error
-    budget = min(data.cache_bytes, _host_memory() // 2)
+    budget = min(data.cache_bytes, host_bytes() // 2)
     factors = [factor for factor, _ in config.schedule.resolution]
     shared, taken = _share_decoded(decoded_shapes(capture, factors), budget // 2, ranks)
     left = max(0, budget - taken)  # this rank's budget may be below that of the rank which made the memory
@@ -131,7 +130,7 @@ def sharing_hint(
     images are reduced in addition. Returns None for a single rank, if the images fit already, or if they are
     too many for the host's memory.
     """
-    size, memory = size_of(decoded_shapes(capture, factors)), _host_memory() // 2
+    size, memory = size_of(decoded_shapes(capture, factors)), host_bytes() // 2
     if local_ranks == 1 or size <= min(cache_bytes, memory) // 2 or size > memory // 2:
         return None
     gigabytes = -(-2 * size // 10**9)
@@ -139,16 +138,6 @@ def sharing_hint(
         "each rank decodes the photographs for itself: with "
         f"--data.cache_bytes={gigabytes}_000_000_000, the ranks of a host would share them"
     )
-
-
-def _host_memory() -> int:
-    """Return the bytes of memory that this host has, or that its container may use."""
-    size = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    try:
-        limit = _CONTAINER_LIMIT.read_text().strip()
-    except OSError:
-        return size
-    return min(size, int(limit)) if limit.isdigit() else size
 
 
 def check_capture(space: Space, capture: Capture, folder: Path) -> None:

@@ -104,7 +104,9 @@ def set_up(
     progress.train_views = train_views
     # The spawn gate is compared with that of the checkpoint.
     veto, progress.gate = open_spawn_gate(config, capture, ranks, progress.gate)
-    check_room(folder, table, ranks, config.population.max_gaussians)
+    is_saved = restored is not None and progress.step >= schedule.steps and not progress.events_left
+    if not is_saved:
+        check_room(folder, table, ranks, config.population.max_gaussians)
 
     run_id = restored.run_id if restored is not None else ranks.broadcast_object(secrets.token_hex(4))
     if ranks.rank == 0:
@@ -151,6 +153,7 @@ def set_up(
         save_clock=SaveClock(config.log.checkpoint_seconds),
         veto=veto,
         lineage=lineage,
+        is_saved=is_saved,
         curve=Curve(**progress.curve),
         log=RunLog(None, schedule.iterations, progress.step * schedule.batch_size, tensorboard=False),
     )

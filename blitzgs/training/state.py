@@ -110,6 +110,7 @@ class TrainingState:
     veto: Veto | None  # withholds candidates of densification from `schedule.gate_from` on, or None
     lineage: Lineage | None  # logs births and deaths, or None
     log: RunLog  # log of the run; it does nothing until the loop opens the run's log
+    is_saved: bool = False  # whether the run was resumed at its end, which its checkpoint has
     growth_was_limited: bool = False  # whether the log has already reported that a limit holds growth back
     curve: Curve = field(default_factory=Curve)  # training PSNR of the run
     # Returns whether the run has to stop soon, the same on every rank; long events call it every few seconds.

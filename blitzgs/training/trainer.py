@@ -311,8 +311,9 @@ class Trainer:
         state.catch_up()
         if state.population() == 0:
             raise ModelLostError("no Gaussian is left: do the poses and the points belong together?")
-        with state.stage("final_checkpoint"):
-            save.save_last(state, save.PATIENCE_SECONDS, lambda: agreement.now(step).signal is not None)
+        if not state.is_saved:
+            with state.stage("final_checkpoint"):
+                save.save_last(state, save.PATIENCE_SECONDS, lambda: agreement.now(step).signal is not None)
         population = population_report(state, self.memory)
         state.log.event(state.images_seen, "population", population, describe(population))
         images = state.images.memory()

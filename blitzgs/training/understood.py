@@ -343,8 +343,8 @@ def small_batch_hint(batch_size: int, world_size: int) -> str | None:
     if world_size == 1 or batch_size >= enough:
         return None
     return (
-        f"a step of {batch_size} views may be no faster on {world_size} ranks than on one: try "
-        f"--schedule.batch_size={enough}, which also scales the learning rates"
+        f"a step of {batch_size} view{'s' * (batch_size > 1)} may be no faster on {world_size} ranks than on "
+        f"one: try --schedule.batch_size={enough}, which also scales the learning rates"
     )
 
 

@@ -148,6 +148,6 @@ def _free(device: torch.device) -> int:
 
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
-    import psutil
+    from blitzgs.util.memory import available_bytes
 
-    return int(psutil.virtual_memory().available)
+    return available_bytes()

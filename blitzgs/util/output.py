@@ -83,7 +83,8 @@ def check_replaceable(path: Path, ours: tuple[bytes, ...] = (), otherwise: str =
     if not stat.S_ISREG(mode):
         kinds = {stat.S_IFLNK: "a symbolic link", stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe"}
         kind = kinds.get(stat.S_IFMT(mode), "a device or socket")
-        raise OSError(f"{path} is {kind}, which is not overwritten: remove it or choose another name")
+        remedy = "name a file in it" if stat.S_ISDIR(mode) else "remove it or choose another name"
+        raise OSError(f"{path} is {kind}, which is not overwritten: {remedy}")
     if ours:
         with open(path, "rb") as file:
             start = file.read(2000)

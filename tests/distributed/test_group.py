@@ -287,6 +287,28 @@ def test_a_store_that_ends_before_the_ranks_have_joined_is_said(monkeypatch):
     dog.stop()
 
 
+def test_a_job_whose_store_ends_works_on_and_says_so_once(monkeypatch, capsys):
+    class Ending(HashStore):
+        is_there, asked = True, 0
+
+        def set(self, key, value):
+            self.asked += not self.is_there
+            if not self.is_there:
+                raise RuntimeError("Broken pipe")
+            super().set(key, value)
+
+    store = Ending()
+    monkeypatch.setattr(watchdog, "open_store", lambda *_args, **_options: store)
+    dog = watchdog.Watchdog(0, 2, 0.1)
+    with dog.waiting("all_reduce"):
+        store.is_there = False
+        dog.thread.join(timeout=10)
+    for _ in range(3):
+        with dog.working("writing a checkpoint"):
+            pass
+    assert store.asked == 1 and f"process {os.getpid()} works on without it" in capsys.readouterr().err
+
+
 VIEWS = 3
 
 

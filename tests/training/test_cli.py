@@ -125,6 +125,10 @@ def test_torchrun_entry(trained, tmp_path):
         ("train --data d --out x --device tpu", 1, "cuda or cuda:N, got 'tpu'"),
         ("train --data d --out ''", 2, "argument --out: the path is empty"),
         ("eval ''", 2, "argument MODEL: the path is empty"),
+        ("eval .", 1, ". is not a run: it has no config.yaml and no checkpoints: name the --out of a"),
+        ("eval '~/runs'", 1, "/home/me/runs is not a run"),
+        ("train d --out x", 2, "unrecognized arguments: d; did you mean --data d?"),
+        ("train --config=~/c.yaml --out x", 1, "/home/me/c.yaml: no such file or recipe"),
         ("synth .", 1, "the folder must be given by its name, got '.'"),
         ("synth city --processes=-2", 1, "processes must be at least 1, got -2"),
         ("train --data loop --out x", 1, "loop is not a folder"),
@@ -139,6 +143,7 @@ def test_torchrun_entry(trained, tmp_path):
 def test_mistakes_get_a_message(command, status, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "300")
+    monkeypatch.setenv("HOME", "/home/me")
     Path("loop").symlink_to("loop")
     Path("file").touch()
     Path("old/checkpoints/checkpoint_000000").mkdir(parents=True)
@@ -149,6 +154,23 @@ def test_mistakes_get_a_message(command, status, message, capsys, tmp_path, monk
     assert result == status
     printed = capsys.readouterr().err
     assert message in printed and "Traceback" not in printed and "usage:" not in printed
+
+
+@pytest.mark.parametrize("command", ["view x", "export x --ply m.ply", "sfm x y", "synth x"])
+def test_commands_of_one_process_refuse_torchrun(command, monkeypatch, tmp_path, failure):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
+    monkeypatch.chdir(tmp_path)
+    assert "this is the work of one process: run it without torchrun" in failure(*command.split())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_python_without_our_packages_is_named(tmp_path):
+    without = "import sys; sys.modules |= {'numpy': None, 'rich': None}; from blitzgs.cli import main"
+    code = f"{without}; sys.exit(main(['train', '--data', 'd', '--out', 'x']))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"blitzgs train: {sys.executable} has no numpy: use the Python of")
 
 
 def test_another_capture_is_refused(trained, tmp_path, failure):

@@ -5,10 +5,12 @@ import errno
 import itertools
 import json
 import os
+import shutil
 import signal
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -358,7 +360,11 @@ def test_a_resume_repeats_no_record_and_says_where_it_begins(tmp_path, monkeypat
         file.write('{"t": 61, "lo')  # torn
     monkeypatch.undo()
     trainer(tmp_path, "schedule.checkpoint_every=50", resume=True).train()
-    trainer(tmp_path, "schedule.checkpoint_every=50", resume=True).train()  # the finished run once more
+    before = checkpoints(tmp_path)
+    # The finished run once more: it is measured, and not saved, for which there is no space.
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
+    trainer(tmp_path, "schedule.checkpoint_every=50", resume=True).train()
+    assert checkpoints(tmp_path) == before
     found = read_log(tmp_path)
     assert [r["t"] for r in found if "loss" in r] == [20, 40, 60, 80, 100]
     for event in ("population", "image_memory", "evaluation"):
@@ -368,8 +374,7 @@ def test_a_resume_repeats_no_record_and_says_where_it_begins(tmp_path, monkeypat
     assert origins == [
         f"nothing to resume in {tmp_path}: starting anew",
         "resumed from checkpoint_000000 (the newest) after 51 steps",
-        f"resumed from {checkpoints(tmp_path)[-2]} (the newest) after 100 steps, its end (--extend trains it "
-        "longer)",
+        f"resumed from {before[-1]} (the newest) after 100 steps, its end (--extend trains it longer)",
     ]
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["run"] == found[0]["run"]

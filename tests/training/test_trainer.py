@@ -269,13 +269,14 @@ def test_the_start_line_names_the_size_of_downscaled_images(tmp_path, capsys):
     assert "; images of at most 48 x 32 (data.downscale=2)" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("batch", "ranks", "enough"), [(4, 4, 16), (7, 2, 8), (8, 2, None), (1, 1, None)])
+@pytest.mark.parametrize(("batch", "ranks", "enough"), [(1, 4, 16), (7, 2, 8), (8, 2, None), (1, 1, None)])
 def test_a_batch_that_is_small_for_its_ranks_gets_a_hint(batch, ranks, enough):
     hint = small_batch_hint(batch, ranks)
     if enough is None:
         assert hint is None
     else:
-        assert hint.startswith(f"a step of {batch} views may be no faster on {ranks} ranks than on one: ")
+        views = "1 view" if batch == 1 else f"{batch} views"
+        assert hint.startswith(f"a step of {views} may be no faster on {ranks} ranks than on one: ")
         assert f"try --schedule.batch_size={enough}," in hint
 
 

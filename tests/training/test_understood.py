@@ -236,23 +236,9 @@ def test_train_prints_the_block_before_it_trains_and_keeps_its_near_plane(data, 
     assert 0 < load_config(tmp_path / "run" / "config.yaml").model.near <= 0.01
 
 
-@pytest.mark.parametrize(
-    ("limit", "cache_bytes", "budget"),
-    [
-        ("1000000\n", 800_000, 250_000),
-        ("1000000\n", 300_000, 150_000),
-        ("max\n", 300_000, 150_000),
-        (None, 10**9, 4096 * 250 // 2),
-    ],
-)
-def test_ranks_share_at_most_half_of_the_memory_of_a_container_or_host(
-    capture, tmp_path, monkeypatch, limit, cache_bytes, budget
-):
-    if limit is not None:
-        (tmp_path / "memory.max").write_text(limit)
-    monkeypatch.setattr(inputs, "_CONTAINER_LIMIT", tmp_path / "memory.max")
-    pages = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 500 if limit is None else 10**6}
-    monkeypatch.setattr(inputs.os, "sysconf", pages.__getitem__)
+@pytest.mark.parametrize(("cache_bytes", "budget"), [(800_000, 250_000), (300_000, 150_000)])
+def test_ranks_share_at_most_half_of_the_memory(capture, monkeypatch, cache_bytes, budget):
+    monkeypatch.setattr(inputs, "host_bytes", lambda: 1_000_000)
     config = tiny_config(f"data.path={capture}", f"data.cache_bytes={cache_bytes}")
     _, images = inputs.open_capture(config, Ranks(local_world_size=2))
     assert images.compressed.budget == budget and images.decoded.budget == budget // 4 + budget
@@ -260,13 +246,13 @@ def test_ranks_share_at_most_half_of_the_memory_of_a_container_or_host(
 
 def test_ranks_whose_photographs_do_not_fit_get_a_hint(loaded, monkeypatch):
     size = inputs.size_of(inputs.decoded_shapes(loaded))
-    monkeypatch.setattr(inputs, "_host_memory", lambda: 4 * size)
+    monkeypatch.setattr(inputs, "host_bytes", lambda: 4 * size)
     assert inputs.sharing_hint(loaded, 2 * size, 2) is None
     assert inputs.sharing_hint(loaded, 2 * size - 2, 1) is None
     hint = inputs.sharing_hint(loaded, 2 * size - 2, 2)
     assert "each rank decodes the photographs for itself" in hint
     assert "--data.cache_bytes=1_000_000_000," in hint  # rounded up to whole gigabytes
-    monkeypatch.setattr(inputs, "_host_memory", lambda: 4 * size - 4)
+    monkeypatch.setattr(inputs, "host_bytes", lambda: 4 * size - 4)
     assert inputs.sharing_hint(loaded, 2 * size - 2, 2) is None
 
 

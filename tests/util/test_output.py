@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files and terminals: names, progress, laps and charts."""
+"""Files and terminals: names, progress, laps and charts; memory."""
 
 import os
 import time
@@ -11,7 +11,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from blitzgs.util import progress
+from blitzgs.util import memory, progress
 from blitzgs.util.charts import line_chart
 from blitzgs.util.errors import amount, printable
 from blitzgs.util.output import OutputFolder, new_file, write_file
@@ -112,7 +112,8 @@ def test_only_regular_files_are_replaced(tmp_path, kind):
     elif kind == "pipe":
         os.mkfifo(path)
     before = path.lstat()
-    refused(OSError, "which is not overwritten", write_file, path, b"new")
+    remedy = "name a file in it" if kind == "folder" else "remove it or choose another name"
+    refused(OSError, f"which is not overwritten: {remedy}", write_file, path, b"new")
     assert path.lstat().st_ino == before.st_ino and path.lstat().st_mode == before.st_mode
 
 
@@ -234,3 +235,31 @@ def test_amounts_have_a_unit_that_fits():
     assert [amount(size) for size in sizes] == [
         "0 bytes", "999 bytes", "1.23 kB", "1.00 MB", "12.3 MB", "8.00 GB", "1,234 GB"
     ]  # fmt: skip
+
+
+# Memory.
+
+
+@pytest.mark.parametrize(
+    ("group", "limits", "host", "available"),
+    [
+        ("0::/", {"": None}, 8192, 3072),  # no container
+        ("0::/", {"": (5000, 4500)}, 5000, 900),  # in a container; 400 bytes of its use are caches
+        ("3:cpu:/\n0::/job/step", {"job": (9000, 7000), "job/step": ("max", 1)}, 8192, 2400),
+        ("0::/job", {"job": (6000, 6900)}, 6000, 0),
+    ],
+)
+def test_memory_is_that_of_the_container_or_job(tmp_path, monkeypatch, group, limits, host, available):
+    (tmp_path / "meminfo").write_text("MemTotal:  8 kB\nMemFree:  1 kB\nMemAvailable:  3 kB\n")
+    (tmp_path / "own").write_text(group + "\n")
+    for name, found in limits.items():
+        (tmp_path / name).mkdir(parents=True, exist_ok=True)
+        if found is not None:
+            (tmp_path / name / "memory.max").write_text(f"{found[0]}\n")
+            (tmp_path / name / "memory.current").write_text(f"{found[1]}\n")
+            text = "anon 9\ninactive_file 300\nactive_file 100\nslab 7\n"
+            (tmp_path / name / "memory.stat").write_text(text)
+    monkeypatch.setattr(memory, "_HOST", tmp_path / "meminfo")
+    monkeypatch.setattr(memory, "_OWN_GROUP", tmp_path / "own")
+    monkeypatch.setattr(memory, "_GROUPS", tmp_path)
+    assert (memory.host_bytes(), memory.available_bytes()) == (host, available)
