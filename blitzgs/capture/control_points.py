@@ -7,6 +7,7 @@ import csv
 import itertools
 import math
 import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -84,8 +85,9 @@ def _gcp_list(path: Path, lines: Sequence[str]) -> tuple[list[ControlPoint], str
     crs = lines[0].strip() if lines else ""
     points: dict[str, ControlPoint] = {}
     for place, line in enumerate(lines[1:], start=2):
+        line = line.strip()
         # Names may have blanks where tabs separate, as in lists of WebODM.
-        words = line.strip().split("\t" if line.count("\t") >= len(_NUMBERS) else None)
+        words = re.split(r"\s*\t\s*", line) if line.count("\t") >= len(_NUMBERS) else line.split()
         if not words or words[0].startswith("#"):
             continue
         with located(f"{path}: line {place}"):

@@ -204,11 +204,12 @@ def reference_system(crs: str) -> Any:
 
 def _with_heights(crs: str) -> Any:
     """Return a reference system that has heights, above the ellipsoid and in the unit of its lengths."""
-    system = reference_system(crs).to_3d()
-    if not system.is_projected or system.is_compound:
+    flat = reference_system(crs)
+    system = flat.to_3d()
+    if not flat.is_projected or len(flat.axis_info) > 2:
         return system
     content = system.to_json_dict()
-    axes = content["coordinate_system"]["axis"]
+    axes = content.get("source_crs", content)["coordinate_system"]["axis"]  # TOWGS84 binds a system
     axes[2]["unit"] = axes[0]["unit"]
     return type(system).from_json_dict(content)
 
@@ -222,10 +223,10 @@ def converted(positions: Float64, source: Any, target: Any) -> Float64:
     """
     pyproj = optional_package("pyproj", "geo", "this")
     systems = [_with_heights(system) for system in (source, target)]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # ours says what to do
-        ways = pyproj.transformer.TransformerGroup(*systems, always_xy=True)
     try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # ours says what to do
+            ways = pyproj.transformer.TransformerGroup(*systems, always_xy=True)
         transformer = pyproj.Transformer.from_crs(*systems, always_xy=True)
         moved = np.stack(transformer.transform(*positions.T, errcheck=True), axis=1)
     except pyproj.exceptions.ProjError as error:

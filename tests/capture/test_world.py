@@ -14,6 +14,7 @@ from blitzgs.capture.control_points import ControlPoint, align, normalised, plac
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.world import (
     WorldFrame,
+    converted,
     enu_frame,
     fit_similarity,
     frame_beside,
@@ -152,6 +153,12 @@ def test_heights_are_in_the_unit_of_lengths(tmp_path):
     back, error = frame_in(feet, "EPSG:4978", places)
     np.testing.assert_allclose(back.to_world(places), frame.to_world(places), atol=0.1)
     refused(ValueError, "heights in another unit", frame_in, frame, "EPSG:2227+5703", places)
+    # A system with TOWGS84 is bound to its parameters.
+    system = "+proj=utm +zone=10 +ellps=WGS84 +towgs84=0,0,0 +units=us-ft +type=crs"
+    bound, _ = frame_in(frame, system, places)
+    assert bound.to_world(np.zeros(3))[2] == pytest.approx(300 * 3937 / 1200, abs=0.1)
+    engineering = 'LOCAL_CS["site",UNIT["metre",1]]'
+    refused(ValueError, "to EPSG:4978: Error creating", converted, places, engineering, "EPSG:4978")
 
 
 def test_a_projection_of_another_place_and_missing_grids_are_named():
@@ -301,9 +308,10 @@ def test_both_files_of_points_are_read(setting, tmp_path):
     again, crs = read_control_points(tmp_path / "gcp_list.txt")
     assert crs == "EPSG:32632" and [p.marks for p in again] == [p.marks for p in found]
     tabs = [
-        "\t".join(map(str, (e, n, h, x, y, f"Flug 1/{image[:3]} 1.JPG"))) for _, e, n, h, image, x, y in rows
+        "\t".join(map(str, (e, n, h, x, f"\t{y}", f"Flug 1/{image[:3]} 1.JPG ")))
+        for _, e, n, h, image, x, y in rows
     ]
-    (tmp_path / "gcp_list.txt").write_text("\n".join(["EPSG:32632", *tabs]))
+    (tmp_path / "gcp_list.txt").write_text("\n".join(["EPSG:32632", *tabs, "\t" * 6]))
     again, _ = read_control_points(tmp_path / "gcp_list.txt")
     assert {mark[0] for p in again for mark in p.marks} == {"Flug 1/DJI 1.JPG"}
 
