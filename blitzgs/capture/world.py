@@ -126,21 +126,22 @@ def frame_beside(root: Path) -> WorldFrame | None:
     """Return the frame that a file in the folder of a capture gives; None: there is no such file.
 
     It is `geo.json`, or an offset (`offset.xyz`, `*_offset.xyz` or `offset.txt`: three numbers to add), with
-    the reference system in a `.prj` beside it, if there is one, whose name begins alike if there are several.
-    ValueError: the file is damaged, or there are several offsets or reference systems.
+    the reference system in a `.prj` beside it, if there is one: of several, that whose name is, or begins as,
+    the offset's. ValueError: the file is damaged, or there are several offsets or reference systems.
     """
     if (root / GEO).is_file():
         return read_world_frame(root / GEO)
     paths = sorted({*root.glob("*offset.xyz"), *root.glob("offset.txt")})
     if not paths:
         return None
+    every, begin = sorted(root.glob("*.prj")), re.sub(r"_?offset\.\w+$", "", paths[0].name) or "offset"
     # Shapefiles of the site have a .prj of their own.
-    every, begin = sorted(root.glob("*.prj")), re.sub(r"_?offset\.\w+$", "", paths[0].name)
-    systems = [path for path in every if path.name.startswith(begin)] or every
-    for several in (paths, systems):
+    systems = [path for path in every if path.stem == begin]
+    systems = systems or [path for path in every if path.name.startswith(begin)] or every
+    for several, remedy in ((paths, "keep that one"), (systems, f"copy that one to {begin}.prj")):
         if len({read_small(path).strip() for path in several}) > 1:
             shown = ", ".join(path.name for path in several[:5])
-            raise ValueError(f"{root}: {shown} differ, and one says where the capture lies: keep that one")
+            raise ValueError(f"{root}: {shown} differ, and one says where the capture lies: {remedy}")
     return read_offset(paths[0], systems)
 
 

@@ -78,8 +78,15 @@ def test_an_offset_has_the_reference_system_of_its_name(tmp_path):
     (tmp_path / "site_wkt.prj").write_text("EPSG:32633")
     (tmp_path / "border.prj").write_text("EPSG:4326")
     assert frame_beside(tmp_path).crs == "EPSG:32633"
+    (tmp_path / "site.prj").write_text("EPSG:32634")
+    assert frame_beside(tmp_path).crs == "EPSG:32634"
+    (tmp_path / "site.prj").unlink()
     (tmp_path / "site_offset.xyz").rename(tmp_path / "offset.txt")
-    refused(ValueError, "border.prj, site_wkt.prj differ, .* keep that one", frame_beside, tmp_path)
+    message = "border.prj, site_wkt.prj differ, .* copy that one to offset.prj"
+    refused(ValueError, message, frame_beside, tmp_path)
+    (tmp_path / "offset.prj").write_text("EPSG:32633")
+    assert frame_beside(tmp_path).crs == "EPSG:32633"
+    (tmp_path / "offset.prj").unlink()
     (tmp_path / "border.prj").unlink()
     assert frame_beside(tmp_path).crs == "EPSG:32633"
     (tmp_path / "other_offset.xyz").write_text("1 2 3")
