@@ -203,6 +203,18 @@ def reference_system(crs: str) -> Any:
         raise ValueError(f"{crs!r:.60} is no reference system: name one such as EPSG:32633") from error
 
 
+def system_of_lengths(crs: str) -> Any:
+    """Return a reference system with one unit, that of lengths; errors as `reference_system`."""
+    system = reference_system(crs)
+    if system.is_geographic:
+        raise ValueError(f"{crs} ({system.name}) has angles: give places in a projected one, as a UTM zone")
+    if len({axis.unit_name for axis in system.axis_info}) > 1:
+        raise ValueError(
+            f"{crs} ({system.name}) has heights in another unit than lengths: use one with both in one unit"
+        )
+    return system
+
+
 def _with_heights(crs: str) -> Any:
     """Return a reference system that has heights, above the ellipsoid and in the unit of its lengths."""
     flat = reference_system(crs)
@@ -254,17 +266,11 @@ def frame_in(frame: WorldFrame, crs: str, places: Float64) -> tuple[WorldFrame, 
     scale make of the difference at the places of the capture, [N, 3]. ImportError: pyproj is not installed.
     ValueError: the reference system is unknown or has angles, or the places are too few.
     """
-    wanted = reference_system(crs)
+    wanted = system_of_lengths(crs)
     if not (wanted.is_projected or wanted.is_geocentric):
-        raise ValueError(
-            f"{crs} ({wanted.name}) has angles or no place on earth: name a projected one, such as a UTM zone"
-        )
+        raise ValueError(f"{crs} ({wanted.name}) has no place on earth: use a projected one, as a UTM zone")
     if not frame.crs:
         raise ValueError("the present world has no reference system, so it cannot be converted: use --gcp")
-    if len({axis.unit_name for axis in wanted.axis_info}) > 1:
-        raise ValueError(
-            f"{crs} ({wanted.name}) has heights in another unit than lengths: name one with both in one unit"
-        )
     around = places.mean(axis=0) + np.ptp(places, axis=0).max() * 0.1 * np.concatenate(
         [np.eye(3), -np.eye(3)]
     )
