@@ -208,7 +208,8 @@ def system_of_lengths(crs: str) -> Any:
     system = reference_system(crs)
     if system.is_geographic:
         raise ValueError(f"{crs} ({system.name}) has angles: give places in a projected one, as a UTM zone")
-    if len({axis.unit_name for axis in system.axis_info}) > 1:
+    units = [axis.unit_conversion_factor for axis in system.axis_info]
+    if max(units) > 1.001 * min(units):  # feet differ by 2e-6
         raise ValueError(
             f"{crs} ({system.name}) has heights in another unit than lengths: use one with both in one unit"
         )

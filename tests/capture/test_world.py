@@ -21,6 +21,7 @@ from blitzgs.capture.world import (
     frame_in,
     geodetic,
     read_world_frame,
+    system_of_lengths,
 )
 from tests.capture import helpers as files
 from tests.capture.helpers import warned
@@ -160,6 +161,7 @@ def test_heights_are_in_the_unit_of_lengths(tmp_path):
     back, error = frame_in(feet, "EPSG:4978", places)
     np.testing.assert_allclose(back.to_world(places), frame.to_world(places), atol=0.1)
     refused(ValueError, "heights in another unit", frame_in, frame, "EPSG:2227+5703", places)
+    assert system_of_lengths("EPSG:2227+8228").axis_info[2].unit_name == "foot"  # beside US survey feet
     # A system with TOWGS84 is bound to its parameters.
     system = "+proj=utm +zone=10 +ellps=WGS84 +towgs84=0,0,0 +units=us-ft +type=crs"
     bound, _ = frame_in(frame, system, places)
