@@ -7,9 +7,12 @@ import csv
 import itertools
 import math
 import os
+import re
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,6 +23,7 @@ from blitzgs.capture.names import any_case, by_parts
 from blitzgs.capture.world import WorldFrame, fit_similarity, utm_of_text
 from blitzgs.util.errors import located
 
+T = TypeVar("T")
 # The least angle between two rays to a point, in degrees: below it, its distance is unknown.
 _LEAST_ANGLE = 1.0
 _COLUMNS = ("name", "e", "n", "h", "image", "x", "y")
@@ -84,8 +88,9 @@ def _gcp_list(path: Path, lines: Sequence[str]) -> tuple[list[ControlPoint], str
     crs = lines[0].strip() if lines else ""
     points: dict[str, ControlPoint] = {}
     for place, line in enumerate(lines[1:], start=2):
+        line = line.strip()
         # Names may have blanks where tabs separate, as in lists of WebODM.
-        words = line.strip().split("\t" if line.count("\t") >= len(_NUMBERS) else None)
+        words = re.split(r"\s*\t\s*", line) if line.count("\t") >= len(_NUMBERS) else line.split()
         if not words or words[0].startswith("#"):
             continue
         with located(f"{path}: line {place}"):
@@ -114,9 +119,10 @@ def place(points: Sequence[ControlPoint], cameras: Sequence[Camera], origin: Flo
 
     The cameras are those of a capture that was loaded without downscaling, `origin` is its `Capture.offset`.
     """
-    by_name, found = _cameras_of({mark[0] for point in points for mark in point.marks}, cameras), []
+    names = {any_case(mark[0]) for point in points for mark in point.marks}
+    by_name, found = _cameras_of(names, cameras), []
     for point in points:
-        marks = [(by_name.get(mark[0]), *mark) for mark in point.marks]
+        marks = [(by_name.get(any_case(mark[0])), *mark) for mark in point.marks]
         placed = replace(point, seen=[(camera, x, y) for camera, _, x, y in marks if camera is not None])
         found.append(placed)
         if len({camera.name for camera, _, _ in placed.seen}) < 2:
@@ -136,21 +142,24 @@ def place(points: Sequence[ControlPoint], cameras: Sequence[Camera], origin: Flo
 def _cameras_of(names: Iterable[str], cameras: Sequence[Camera]) -> dict[str, Camera]:
     """Return the cameras of names of photographs, which may lack folders, or have those of another machine.
 
-    Of several photographs of one name, in folders of several flights, the folders decide.
+    Of several photographs of one name, in folders of several flights, the folders decide; so they do of
+    several names that only one photograph fits. Names are as of `any_case`.
     """
     known = by_parts(camera.name for camera in cameras)
     folders = [any_case(camera.name).split("/")[-2::-1] for camera in cameras]
-    found, certain = {}, set()
+    fitting: dict[int, dict[str, int]] = defaultdict(dict)
     for name in names:
-        last, *own = any_case(name).split("/")[::-1]
+        last, *own = name.split("/")[::-1]
         same = {index: len(os.path.commonprefix([own, folders[index]])) for index in known.get(last, [])}
-        best = [index for index, count in same.items() if count == max(same.values())]
-        if len(best) == 1:
-            found[name] = best[0]
-            if same[best[0]] == min(len(own), len(folders[best[0]])):
-                certain.add(name)
-    taken = {found[name] for name in certain}
-    return {name: cameras[i] for name, i in found.items() if name in certain or i not in taken}
+        for index in _best(same):
+            fitting[index][name] = same[index]
+    return {name: cameras[index] for index, some in fitting.items() for name in _best(some)}
+
+
+def _best(scores: Mapping[T, int]) -> list[T]:
+    """Return the key of the largest number; none if there are several."""
+    most = [key for key, score in scores.items() if score == max(scores.values())]
+    return most if len(most) == 1 else []
 
 
 def normalised(lens: Lens, x: float, y: float) -> Float64:

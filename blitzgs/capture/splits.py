@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 
@@ -64,7 +65,8 @@ def _listed(names: Sequence[str], path: Path) -> list[int]:
         entry = line.split("#")[0].strip().replace("\\", "/")
         if not entry:
             continue
-        found = lookup.get(any_case(entry), [])
+        of_windows = os.fsencode(entry).decode("cp1252", errors="replace")
+        found = lookup.get(any_case(entry)) or lookup.get(any_case(of_windows), [])
         found = [index for index in found if names[index] == entry] or found
         if len(found) != 1:
             problem = f"names {len(found)} views" if found else "names no view of the capture"

@@ -126,21 +126,22 @@ def frame_beside(root: Path) -> WorldFrame | None:
     """Return the frame that a file in the folder of a capture gives; None: there is no such file.
 
     It is `geo.json`, or an offset (`offset.xyz`, `*_offset.xyz` or `offset.txt`: three numbers to add), with
-    the reference system in a `.prj` beside it, if there is one, whose name begins alike if there are several.
-    ValueError: the file is damaged, or there are several offsets or reference systems.
+    the reference system in a `.prj` beside it, if there is one: of several, that whose name is, or begins as,
+    the offset's. ValueError: the file is damaged, or there are several offsets or reference systems.
     """
     if (root / GEO).is_file():
         return read_world_frame(root / GEO)
     paths = sorted({*root.glob("*offset.xyz"), *root.glob("offset.txt")})
     if not paths:
         return None
+    every, begin = sorted(root.glob("*.prj")), re.sub(r"_?offset\.\w+$", "", paths[0].name) or "offset"
     # Shapefiles of the site have a .prj of their own.
-    every, begin = sorted(root.glob("*.prj")), re.sub(r"_?offset\.\w+$", "", paths[0].name)
-    systems = [path for path in every if path.name.startswith(begin)] or every
-    for several in (paths, systems):
+    systems = [path for path in every if path.stem == begin]
+    systems = systems or [path for path in every if path.name.startswith(begin)] or every
+    for several, remedy in ((paths, "keep that one"), (systems, f"copy that one to {begin}.prj")):
         if len({read_small(path).strip() for path in several}) > 1:
             shown = ", ".join(path.name for path in several[:5])
-            raise ValueError(f"{root}: {shown} differ, and one says where the capture lies: keep that one")
+            raise ValueError(f"{root}: {shown} differ, and one says where the capture lies: {remedy}")
     return read_offset(paths[0], systems)
 
 
@@ -202,13 +203,27 @@ def reference_system(crs: str) -> Any:
         raise ValueError(f"{crs!r:.60} is no reference system: name one such as EPSG:32633") from error
 
 
+def system_of_lengths(crs: str) -> Any:
+    """Return a reference system with one unit, that of lengths; errors as `reference_system`."""
+    system = reference_system(crs)
+    if system.is_geographic:
+        raise ValueError(f"{crs} ({system.name}) has angles: give places in a projected one, as a UTM zone")
+    units = [axis.unit_conversion_factor for axis in system.axis_info]
+    if max(units) > 1.001 * min(units):  # feet differ by 2e-6
+        raise ValueError(
+            f"{crs} ({system.name}) has heights in another unit than lengths: use one with both in one unit"
+        )
+    return system
+
+
 def _with_heights(crs: str) -> Any:
     """Return a reference system that has heights, above the ellipsoid and in the unit of its lengths."""
-    system = reference_system(crs).to_3d()
-    if not system.is_projected or system.is_compound:
+    flat = reference_system(crs)
+    system = flat.to_3d()
+    if not flat.is_projected or len(flat.axis_info) > 2:
         return system
     content = system.to_json_dict()
-    axes = content["coordinate_system"]["axis"]
+    axes = content.get("source_crs", content)["coordinate_system"]["axis"]  # TOWGS84 binds a system
     axes[2]["unit"] = axes[0]["unit"]
     return type(system).from_json_dict(content)
 
@@ -222,10 +237,10 @@ def converted(positions: Float64, source: Any, target: Any) -> Float64:
     """
     pyproj = optional_package("pyproj", "geo", "this")
     systems = [_with_heights(system) for system in (source, target)]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # ours says what to do
-        ways = pyproj.transformer.TransformerGroup(*systems, always_xy=True)
     try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # ours says what to do
+            ways = pyproj.transformer.TransformerGroup(*systems, always_xy=True)
         transformer = pyproj.Transformer.from_crs(*systems, always_xy=True)
         moved = np.stack(transformer.transform(*positions.T, errcheck=True), axis=1)
     except pyproj.exceptions.ProjError as error:
@@ -252,17 +267,11 @@ def frame_in(frame: WorldFrame, crs: str, places: Float64) -> tuple[WorldFrame, 
     scale make of the difference at the places of the capture, [N, 3]. ImportError: pyproj is not installed.
     ValueError: the reference system is unknown or has angles, or the places are too few.
     """
-    wanted = reference_system(crs)
+    wanted = system_of_lengths(crs)
     if not (wanted.is_projected or wanted.is_geocentric):
-        raise ValueError(
-            f"{crs} ({wanted.name}) has angles or no place on earth: name a projected one, such as a UTM zone"
-        )
+        raise ValueError(f"{crs} ({wanted.name}) has no place on earth: use a projected one, as a UTM zone")
     if not frame.crs:
         raise ValueError("the present world has no reference system, so it cannot be converted: use --gcp")
-    if len({axis.unit_name for axis in wanted.axis_info}) > 1:
-        raise ValueError(
-            f"{crs} ({wanted.name}) has heights in another unit than lengths: name one with both in one unit"
-        )
     around = places.mean(axis=0) + np.ptp(places, axis=0).max() * 0.1 * np.concatenate(
         [np.eye(3), -np.eye(3)]
     )

@@ -20,6 +20,7 @@ from blitzgs.capture.world import (
     frame_in,
     gps_positions,
     reference_system,
+    system_of_lengths,
 )
 from blitzgs.cli.arguments import DATA, RUN, Commands, add_arguments, add_command
 from blitzgs.config.files import load_config
@@ -97,10 +98,9 @@ def _by_points(args: argparse.Namespace, capture: Capture) -> WorldFrame:
 
 
 def _check_lengths(crs: str) -> None:
-    """Refuse a reference system of angles, in which points make no similarity; unknown without pyproj."""
+    """Refuse a reference system in which points make no similarity; unknown without pyproj."""
     with suppress(ImportError):
-        if reference_system(crs).is_geographic:
-            raise ValueError(f"{crs} has angles: convert the points to a projected system, as a UTM zone")
+        system_of_lengths(crs)
 
 
 def _warn_if_turned_over(frame: WorldFrame, capture: Capture) -> None:

@@ -15,6 +15,8 @@ from importlib import import_module
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
+from blitzgs.util.memory import available_bytes
+
 if TYPE_CHECKING:
     import torch
 
@@ -148,6 +150,4 @@ def _free(device: torch.device) -> int:
 
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
-    from blitzgs.util.memory import available_bytes
-
     return available_bytes()

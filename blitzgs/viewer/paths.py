@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 # From a camera with the axes right, down, forward to one with right, up, backward.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+# Of a film; all are in memory.
+_MOST_FRAMES = 1_000_000
 
 
 @dataclass
@@ -51,10 +53,17 @@ class CameraPath:
     played: list[Keyframe] = field(default_factory=list)
 
     def frames(self) -> list[Keyframe]:
-        """Return the viewpoints of all frames: positions on a Catmull-Rom spline, rotations interpolated."""
+        """Return the viewpoints of all frames: positions on a Catmull-Rom spline, rotations interpolated.
+
+        ValueError: they are too many.
+        """
         if self.played:
             return self.played
         count = max(1, round(self.fps * self.seconds))
+        if count > _MOST_FRAMES:
+            raise ValueError(
+                f"a film has at most {_MOST_FRAMES:,} frames, got {count:,}: lower fps or seconds"
+            )
         keys = self.keyframes + (self.keyframes[:1] if self.is_cycle else [])
         last = len(keys) - 1
         if last < 1:
@@ -123,8 +132,6 @@ def from_json(text: str) -> CameraPath:
     )
 
 
-# Of a film; all are in memory.
-_MOST_FRAMES = 1e6
 _NO_PATH = "this is no camera path in the layout of nerfstudio"
 
 

@@ -269,6 +269,8 @@ def test_points_without_a_reference_system_have_that_of_the_project(tmp_path, cr
     chunk, scale, shift = files.metashape(capture, path)
     system = pyproj.CRS(crs).to_3d()
     wkt = pyproj.CRS(crs).to_wkt("WKT2_2019" if crs == "EPSG:4979" else "WKT1_GDAL")
+    spheroid = 'SPHEROID["WGS 84",6378137,298.257223563,AUTHORITY["EPSG","7030"]]'
+    wkt = wkt.replace(spheroid, f"{spheroid},TOWGS84[0,0,0,0,0,0,0]")  # as Metashape writes
     path.write_text(
         re.sub("<reference>.*</reference>", lambda _: f"<reference>{wkt}</reference>", path.read_text())
     )

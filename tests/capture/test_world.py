@@ -14,12 +14,14 @@ from blitzgs.capture.control_points import ControlPoint, align, normalised, plac
 from blitzgs.capture.lens import Lens
 from blitzgs.capture.world import (
     WorldFrame,
+    converted,
     enu_frame,
     fit_similarity,
     frame_beside,
     frame_in,
     geodetic,
     read_world_frame,
+    system_of_lengths,
 )
 from tests.capture import helpers as files
 from tests.capture.helpers import warned
@@ -77,8 +79,15 @@ def test_an_offset_has_the_reference_system_of_its_name(tmp_path):
     (tmp_path / "site_wkt.prj").write_text("EPSG:32633")
     (tmp_path / "border.prj").write_text("EPSG:4326")
     assert frame_beside(tmp_path).crs == "EPSG:32633"
+    (tmp_path / "site.prj").write_text("EPSG:32634")
+    assert frame_beside(tmp_path).crs == "EPSG:32634"
+    (tmp_path / "site.prj").unlink()
     (tmp_path / "site_offset.xyz").rename(tmp_path / "offset.txt")
-    refused(ValueError, "border.prj, site_wkt.prj differ, .* keep that one", frame_beside, tmp_path)
+    message = "border.prj, site_wkt.prj differ, .* copy that one to offset.prj"
+    refused(ValueError, message, frame_beside, tmp_path)
+    (tmp_path / "offset.prj").write_text("EPSG:32633")
+    assert frame_beside(tmp_path).crs == "EPSG:32633"
+    (tmp_path / "offset.prj").unlink()
     (tmp_path / "border.prj").unlink()
     assert frame_beside(tmp_path).crs == "EPSG:32633"
     (tmp_path / "other_offset.xyz").write_text("1 2 3")
@@ -152,6 +161,13 @@ def test_heights_are_in_the_unit_of_lengths(tmp_path):
     back, error = frame_in(feet, "EPSG:4978", places)
     np.testing.assert_allclose(back.to_world(places), frame.to_world(places), atol=0.1)
     refused(ValueError, "heights in another unit", frame_in, frame, "EPSG:2227+5703", places)
+    assert system_of_lengths("EPSG:2227+8228").axis_info[2].unit_name == "foot"  # beside US survey feet
+    # A system with TOWGS84 is bound to its parameters.
+    system = "+proj=utm +zone=10 +ellps=WGS84 +towgs84=0,0,0 +units=us-ft +type=crs"
+    bound, _ = frame_in(frame, system, places)
+    assert bound.to_world(np.zeros(3))[2] == pytest.approx(300 * 3937 / 1200, abs=0.1)
+    engineering = 'LOCAL_CS["site",UNIT["metre",1]]'
+    refused(ValueError, "to EPSG:4978: Error creating", converted, places, engineering, "EPSG:4978")
 
 
 def test_a_projection_of_another_place_and_missing_grids_are_named():
@@ -253,9 +269,11 @@ def test_folders_tell_photographs_of_one_name_apart(setting):
     loose = [replace(camera, name=camera.name.rpartition("/")[2]) for camera in first]
     marks = [mark for mark in points[0].marks if "Flug 1" in by_old[mark[0]]]
     moved = [(f"D:/{by_old[name]}", x, y) for name, x, y in marks]
-    assert len(place([ControlPoint("P", points[0].world, moved)], loose, capture.offset)[0].seen) == len(
-        first
-    )
+    point = ControlPoint("P", points[0].world, moved)
+    assert len(place([point], loose, capture.offset)[0].seen) == len(first)
+    # Which of two flights the photographs without folders are of is unknown.
+    other = [(name.replace("Flug 1", "Flug 2"), x, y) for name, x, y in moved]
+    assert not place([replace(point, marks=moved + other)], loose, capture.offset)[0].seen
 
 
 def test_points_on_a_line_and_too_few_are_refused(setting):
@@ -301,9 +319,10 @@ def test_both_files_of_points_are_read(setting, tmp_path):
     again, crs = read_control_points(tmp_path / "gcp_list.txt")
     assert crs == "EPSG:32632" and [p.marks for p in again] == [p.marks for p in found]
     tabs = [
-        "\t".join(map(str, (e, n, h, x, y, f"Flug 1/{image[:3]} 1.JPG"))) for _, e, n, h, image, x, y in rows
+        "\t".join(map(str, (e, n, h, x, f"\t{y}", f"Flug 1/{image[:3]} 1.JPG ")))
+        for _, e, n, h, image, x, y in rows
     ]
-    (tmp_path / "gcp_list.txt").write_text("\n".join(["EPSG:32632", *tabs]))
+    (tmp_path / "gcp_list.txt").write_text("\n".join(["EPSG:32632", *tabs, "\t" * 6]))
     again, _ = read_control_points(tmp_path / "gcp_list.txt")
     assert {mark[0] for p in again for mark in p.marks} == {"Flug 1/DJI 1.JPG"}
 

@@ -328,7 +328,8 @@ def test_what_cannot_be_aligned_is_refused(trained, survey, tmp_path, failure):
     unknown = "has no geo.json, so its place in the world is unknown: use blitzgs align"
     assert unknown in failure("export", run, *world)
     pytest.importorskip("pyproj")
-    assert "EPSG:4326 has angles" in failure("align", run, "--crs", "EPSG:4326")
+    assert "EPSG:4326 (WGS 84) has angles" in failure("align", run, "--crs", "EPSG:4326")
+    assert "heights in another unit" in failure("align", run, "--gcp", path, "--crs", "EPSG:2227+5703")
     with pytest.raises(SystemExit):
         main(["align", run])
     assert load_world_frame(trained[1]) is None

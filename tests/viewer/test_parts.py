@@ -290,6 +290,8 @@ def test_a_path_of_the_viewer_is_played_as_it_was_or_with_another_pace(tmp_path)
 
 
 def test_an_orbit_goes_around_the_middle():
+    endless = read_film("orbit", None, 1e4, 1e4)
+    refused(ValueError, "at most 1,000,000 frames, got 100,000,000", endless.cameras, SPACE, aerial(), BOX)
     cameras = read_film("orbit", (64, 48), 4, 9).cameras(SPACE, aerial(), BOX)
     places = np.array([np.linalg.inv(camera.world_to_camera) for camera in cameras])
     centres = places[:, :3, 3]
