@@ -4,6 +4,7 @@
 import pytest
 import torch
 
+from blitzgs.ops.project import queue_projection
 from blitzgs.ops.projection_types import VIEW_TOTALS, Sizes, splats_of
 from blitzgs.ops.rasterize import RasterizeSaved
 from tests.cuda.conftest import Scene, ops, relative_error
@@ -118,8 +119,8 @@ def test_splats_with_nan_vanish_and_spread_nowhere(scene):
 
 def test_ranks_of_splats_match_the_cpu(scene):
     tiles = [(0, 40), (30, 30), (30, 90), (50, 140)]
-    expected = scene.inputs("cpu").project(None, tiles)
-    found = scene.inputs("cuda").project(None, tiles)
+    expected = queue_projection(scene.inputs("cpu"), None, tiles)
+    found = queue_projection(scene.inputs("cuda"), None, tiles)
     assert torch.equal(found.totals.cpu(), expected.totals)
     masks = expected.splats.rank_masks
     assert torch.equal(found.splats.rank_masks.cpu(), masks)
@@ -150,7 +151,7 @@ def test_splats_do_not_depend_on_the_capacity_that_was_guessed(scene, splats_see
         inputs = inputs._replace(gaussians=[torch.full_like(inputs.gaussians[0], 1e6), *inputs.gaussians[1:]])
     ids = 7919 * torch.arange(len(inputs.gaussians[0]), device="cuda")
     inputs = inputs._replace(ids=ids)
-    expected, expected_ids, totals = inputs.project(None)
+    expected, expected_ids, totals = queue_projection(inputs, None)
     counts = totals.cpu()[:3]
     visible, splats, _ = counts.tolist()
     assert (splats > visible > 100) == splats_seen
@@ -162,9 +163,9 @@ def test_splats_do_not_depend_on_the_capacity_that_was_guessed(scene, splats_see
     for size in [*sizes, (2 * visible + 3, 3 * splats + 1000)]:
         if min(size) < 1:
             with pytest.raises(RuntimeError, match="how many visible Gaussians and splats there is room for"):
-                inputs.project(Sizes(*size, 0))
+                queue_projection(inputs, Sizes(*size, 0))
             continue
-        written, splat_ids, counted = inputs.project(Sizes(*size, 0))
+        written, splat_ids, counted = queue_projection(inputs, Sizes(*size, 0))
         assert torch.equal(counted, totals)
         if size[0] < visible or size[1] < splats:
             continue

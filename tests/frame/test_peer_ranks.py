@@ -36,10 +36,10 @@ class ThreadRanks(Ranks):
         return torch.cat(parts)
 
 
-def _intersect(*arguments):
+def _intersect(*arguments, unchecked):
     """Replaces `intersect` for a capacity below the number of entries, which the CPU op refuses."""
-    *given, _, n_splats, _ = arguments
-    return INTERSECT(*given, -1, n_splats, True)
+    *given, _, n_splats = arguments
+    return INTERSECT(*given, -1, n_splats, unchecked)
 
 
 @pytest.fixture(autouse=True)

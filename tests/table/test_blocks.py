@@ -6,7 +6,7 @@ import torch
 
 from blitzgs.ops.blocks import cull_blocks, morton_keys
 from blitzgs.ops.lazy_adam import AdamSchedule, AdamState, lazy_adam_catch_up_
-from blitzgs.ops.project import project
+from blitzgs.ops.project import project, queue_projection
 from blitzgs.ops.projection_types import ProjectionInputs, ProjectionOptions, Views
 from blitzgs.table.blocks import BlockIndex, morton_order
 from blitzgs.table.table import EXP_AVG_SQS, EXP_AVGS, PARAMETERS, GaussianTable
@@ -158,7 +158,7 @@ def caught_up_and_projected(table, ids, views, count, viewmats, Ks):
     active = [tensor for tensor in (ids, views, count) if tensor is not None]
     options = ProjectionOptions(WIDTH, HEIGHT, near_plane=NEAR, far_plane=FAR)
     inputs = ProjectionInputs([after[name] for name in PARAMETERS], (viewmats, Ks), options, active)
-    splats, _, totals = inputs.project(None, [(0, 50)])
+    splats, _, totals = queue_projection(inputs, None, [(0, 50)])
     return [*after.values(), *splats._replace(counts=totals)]
 
 
