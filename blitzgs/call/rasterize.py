@@ -23,7 +23,6 @@ from blitzgs.call.extras import check_without_ut, checked_pixels, with_covarianc
 from blitzgs.call.ranks import gather_views
 from blitzgs.call.render import render
 from blitzgs.ops.intersect import TILE_SIZE
-from blitzgs.util.errors import explain_memory
 
 # Colours of networks under autocast, and of SH tables in half precision.
 _HALF = (torch.float16, torch.bfloat16)
@@ -228,8 +227,4 @@ def rasterization(
     if distributed:
         same = (width, height, projection.tile_size, render_mode, return_normals)
         gaussians, ranks = gather_views(gaussians, absgrad, same)
-    try:
-        return render(gaussians, projection, image, ranks=ranks)
-    except (RuntimeError, MemoryError) as error:
-        explain_memory(error, gaussians.images, width, height, means.shape[-2], means.device)
-        raise
+    return render(gaussians, projection, image, ranks=ranks)

@@ -40,6 +40,7 @@ from blitzgs.ops.projection_types import (
 )
 from blitzgs.ops.rasterize import rasterize
 from blitzgs.ops.unscented import Lenses, project_unscented
+from blitzgs.util.errors import explain_memory
 
 _CHANNELS_AT_A_TIME = 64
 _EXACT = LocalTransport(exact=True)
@@ -73,7 +74,22 @@ def render(
     ranks: Ranks | None = None,  # among which Gaussians and views are divided; None: all here
     tables: ShTables | None = None,  # the SH, if only the rows of visible Gaussians are read
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Render images; return the results of `blitzgs.rasterization`."""
+    """Render images; return the results of `blitzgs.rasterization`. NotEnoughMemoryError: they do not fit."""
+    try:
+        return _rendered(gaussians, projection, image, ranks, tables)
+    except (RuntimeError, MemoryError) as error:
+        size = gaussians.images, projection.width, projection.height, gaussians.n_gaussians
+        explain_memory(error, *size, gaussians.scenes[0].means.device)
+        raise
+
+
+def _rendered(
+    gaussians: Gaussians,
+    projection: ProjectionOptions,
+    image: ImageOptions,
+    ranks: Ranks | None,
+    tables: ShTables | None,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
     compiling = torch.compiler.is_compiling()
     shown, nan_marks = _without_non_finite(gaussians)
     groups = _groups_of(shown, projection)

@@ -107,6 +107,18 @@ def test_gradients_may_be_dense_and_sh_one_tensor(device):
     assert relative_error(whole.grad, joined) < 1e-4
 
 
+def test_images_that_do_not_fit_into_memory_are_named(monkeypatch):
+    scene = random_scene(n=5, width=24, height=20)
+
+    def fails(*_, **__):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr("blitzgs.call.render.rasterize", fails)
+    for call in (raw, activated):
+        message = "not enough memory to render 2 views of 24 x 20 pixels with 5 Gaussians"
+        refused(MemoryError, message, call, raw_parameters(scene), scene)
+
+
 def test_depth_has_no_gradient_of_sh():
     scene = random_scene(n=30)
     p = raw_parameters(scene)
