@@ -53,10 +53,13 @@ PLAN = (
 
 
 def is_measured(path: Path) -> bool:
-    """Tell whether a file of results is of this commit."""
+    """Tell whether a file of results is of this commit, and has no run that failed."""
     if not path.exists():
         return False
-    return json.loads(path.read_text())["commit"] == harness.commit()
+    found = json.loads(path.read_text())
+    runs = found.get("runs", found.get("results", []))
+    is_done = all(run.get("status", "done") == "done" for run in runs)
+    return is_done and bool(found["commit"] == harness.commit())
 
 
 def words_of(job: Job, captures: dict[str, str], result: Path) -> list[str]:

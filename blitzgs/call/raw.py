@@ -154,14 +154,14 @@ def _defaults() -> dict[str, Any]:
 
 
 def _catch_up(lazy: Iterable[Any], geometry: Iterable[Tensor], sh: Iterable[Tensor]) -> None:
-    """Catch up the geometry, and whole parameters of which a tensor is a view, or detached."""
-    others = [t for t in (*geometry, *sh) if t._is_view() or not t.requires_grad]
-    memory = {tensor.untyped_storage().data_ptr() for tensor in others}
+    """Catch up the geometry, and whole parameters whose memory a tensor shares: a view, or a detached one."""
+    stepped = {id(param) for optimizer in lazy for param in optimizer.state}
+    memory = {t.untyped_storage().data_ptr() for t in (*geometry, *sh) if id(t) not in stepped}
     for optimizer in lazy:
         optimizer.catch_up(geometry)
         if memory:
-            known = [param for group in optimizer.param_groups for param in group["params"]]
-            optimizer.catch_up([param for param in known if param.untyped_storage().data_ptr() in memory])
+            shared = [param for param in optimizer.state if param.untyped_storage().data_ptr() in memory]
+            optimizer.catch_up(shared)
 
 
 def _check_leaves(params: Mapping[str, Tensor]) -> None:

@@ -105,7 +105,7 @@ def sweep(
         for number, batch in enumerate(batches):
             if stops is not None and number > 0 and stops():
                 raise SweepStoppedError
-            assignment = _assign(batch, options, owners)
+            assignment = _assign(batch, owners)
             visible = finder.find(batch.views, options.limits)
             surveyed = survey(
                 visible.table, batch.views, options, assignment, transport, visible.active, rule == "energy"
@@ -120,7 +120,7 @@ def is_culled(cull: Tensor, column: int) -> Tensor:
     return (cull[:, column // WORD_BITS] >> (column % WORD_BITS) & 1).bool()
 
 
-def _assign(batch: ViewBatch, options: RenderOptions, owners: TileOwners) -> TileAssignment | None:
+def _assign(batch: ViewBatch, owners: TileOwners) -> TileAssignment | None:
     """Divide the tiles of a batch among the ranks, without a halo, which only a loss needs."""
     if owners.ranks.world_size == 1:
         return None

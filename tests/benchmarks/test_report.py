@@ -61,6 +61,11 @@ def test_one_command_measures_what_it_can_and_continues(tmp_path, monkeypatch, c
         assert f"\n{line}" in page
     measure_with(monkeypatch, tmp_path, good)
     assert "exchange" not in capsys.readouterr().out
+    path = tmp_path / "results" / "exchange.json"
+    content = json.loads(path.read_text())
+    content["results"][0]["status"] = "failed"
+    path.write_text(json.dumps(content))
+    assert not measure.is_measured(path)
 
 
 def test_the_commit_is_that_of_the_checkout(monkeypatch):

@@ -238,7 +238,14 @@ def test_what_only_rasterization_or_gsplat_supports_is_refused(option):
         raw(raw_parameters(scene), scene, packd=value)
 
 
-@pytest.mark.parametrize("others", [{}, {"sh0": lambda t: t.squeeze(1), "means": lambda t: t}], ids=len)
+SHARERS = (
+    {},
+    {"sh0": lambda t: t.squeeze(1), "means": lambda t: t},
+    {"shN": lambda t: t.detach().requires_grad_()},
+)
+
+
+@pytest.mark.parametrize("others", SHARERS, ids=len)
 def test_rows_catch_up_behind_what_shares_their_memory(device, others):
     """As in an evaluation of detached parameters, or of views of them."""
     scene = spread(random_scene(n=60, device=device))

@@ -164,7 +164,7 @@ def test_packed_gradients_equal_those_from_columns(degree):
     v_renders = torch.randn_like(frame.renders)
     (packed,) = backward_splats(frame, v_renders).parts
     assert packed.shape == (len(frame.splats.depths), 12)
-    projected, grid = frame.projected, tile_grid(views, options, None)
+    projected, grid = frame.projected, tile_grid(views, None)
     *unpacked, _ = ops.rasterize_bwd(*frame.saved, v_renders, None, *grid, False, True)
     for x, y in zip(gradient_columns(packed), unpacked, strict=True):
         assert y.any() and torch.equal(x, y)
