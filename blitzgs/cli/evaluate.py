@@ -30,7 +30,7 @@ from blitzgs.runs.evaluation import evaluate, load_lpips, worst_views
 from blitzgs.runs.world import check_seen, config_of_file, subject_of_file
 from blitzgs.training.inputs import check_capture, open_capture
 from blitzgs.training.understood import largest_size
-from blitzgs.util.errors import located, printable
+from blitzgs.util.errors import located, printable, warn
 from blitzgs.util.progress import image_progress
 from blitzgs.view.views import Space, ViewSet
 
@@ -79,6 +79,11 @@ def run(args: argparse.Namespace) -> None:
                 raise ValueError("a file is compared with a capture: add --data CAPTURE")
             data = {"path": str(args.data), "downscale": args.downscale or 1}
             config = changed(config_of_file(found), "data", **data)
+            if path.suffix in (".spz", ".splat") and ranks.rank == 0:
+                warn(
+                    f"{path} cannot state a background: all is measured over black, which costs a model that "
+                    "was trained over another colour; measure its run, or export it as PLY or SOG"
+                )
         else:
             if args.downscale is not None:
                 raise ValueError("--downscale is for a file: a run is measured at the size it was trained at")

@@ -68,6 +68,10 @@ def test_a_file_is_measured_as_its_run(trained, whole, tmp_path, capsys, failure
     assert main(["eval", str(whole), *flags, "--downscale=2"]) == 0
     assert "pictures; 1 views, 24 x 16 pixels" in capsys.readouterr().err
     assert "add --data CAPTURE" in failure("eval", whole)
+    spz = tmp_path / "model.spz"
+    assert main(["export", str(trained[1]), "--spz", str(spz)]) == 0
+    with pytest.warns(UserWarning, match="model.spz cannot state a background: all is measured over black"):
+        assert main(["eval", str(spz), *flags]) == 0
     far = read_gaussians(whole)
     write_ply(tmp_path / "far.ply", **vars(dataclasses.replace(far, means=far.means + 1e5)))
     unseen = f"sees one of its {len(far):,} Gaussians: the file must have the coordinates of that capture"
