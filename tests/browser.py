@@ -151,6 +151,17 @@ class Browser:
         wait_for(rests, timeout, f"{text!r} rests")
         self.click(*self.place_of(text))
 
+    def press_until(self, text: str, shown: str):
+        """Click on the element with a text until another text shows: a page in motion may lose a click."""
+
+        def shows():
+            if not self.place_of(shown):
+                self.press(text)
+            with contextlib.suppress(AssertionError):
+                return wait_for(lambda: self.place_of(shown), 10, shown)
+
+        wait_for(shows, 60, f"{shown!r} shows after {text!r}")
+
     def figures(self) -> str:
         """Return the figures over the picture; empty before the first."""
         return self.evaluate("document.getElementById('blitzgs-figures')?.innerText ?? ''")

@@ -287,8 +287,7 @@ def test_the_live_page_follows_a_training(tmp_path, monkeypatch):
         wait_for(lambda: np.abs(picture(browser) - first).mean() > 1, 60, "another picture")
         plots = "document.querySelectorAll('.uplot').length"
         wait_for(lambda: browser.evaluate(plots) == 3, 60, "three curves")
-        browser.press("Pause")
-        wait_for(lambda: browser.place_of("Go on"), 60, "the training pauses")
+        browser.press_until("Pause", "Go on")
 
         def rests():
             before = trainer.state.progress.step
